@@ -51,7 +51,7 @@ __all__ = [
     "train_model",
 ]
 
-_HOMES = {
+_MODULES = {
     "datagen.commands.evaluate": ("evaluate",),
     "datagen.commands.merge": ("merge",),
     "datagen.commands.predict": ("predict",),
@@ -71,17 +71,17 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    for home, names in _HOMES.items():
+    for module, names in _MODULES.items():
         if name in names:
-            value = globals()[name] = getattr(_loaded(home), name)
+            value = globals()[name] = getattr(_loaded(module), name)
             return value
     raise AttributeError(f"module 'datagen' has no attribute {name!r}. It offers: {', '.join(__all__)}")
 
 
-def _loaded(home: str) -> Any:
-    """The module; InputError names the extra of a library that is not installed."""
+def _loaded(module: str) -> Any:
+    """Import the module. InputError for a missing library names the extra that has it."""
     try:
-        return import_module(home)
+        return import_module(module)
     except ModuleNotFoundError as error:
         from datagen.workers.extras import missing_library
 

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 
 EXIT_GOOD, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 0, 2, 130, 141
 
-# Verb -> (where it is defined, its line in --help). A verb returns an exit code, or None for 0; one that is
-# also a Python function returns its result and names what prints it (`prints`).
+# Verb -> (where it is defined, its line in --help). A verb returns an exit code, or None for 0. If it is also
+# a Python function, it returns its result, and `prints` names the function that prints it.
 VERBS: dict[str, tuple[str, str]] = {
     "submit": ("datagen.commands.submit:submit", "Make labels: start a run, or resume it."),
     "resume": ("datagen.commands.resume:resume", "Make the missing labels of a run, or of merged runs."),
@@ -64,10 +64,10 @@ VERBS: dict[str, tuple[str, str]] = {
     "evaluate": ("datagen.commands.evaluate:evaluate", "Compare models with baselines and the paper."),
     "closed-loop": (
         "datagen.commands.closed_loop:closed_loop",
-        "Execute methods' picks where robots park off them.",
+        "Execute methods' picks with arrival errors.",
     ),
     "benchmark": ("datagen.commands.benchmark:app", "Make and score the frozen benchmark."),
-    "frontier": ("datagen.commands.frontier:frontier", "Show which labels pay, and which to buy next."),
+    "frontier": ("datagen.commands.frontier:frontier", "Compare label sources by accuracy and cost."),
     "predict": ("datagen.commands.predict:predict", "Find a base pose in a depth camera's frame."),
     "doctor": ("datagen.doctor:doctor", "Check this machine, and show how to fix what is missing."),
     "assets": ("datagen.assets.cli:app", "List, fetch, lock, verify and split houses and objects."),
@@ -81,14 +81,14 @@ _HEADINGS = {
     "This machine": ("doctor", "assets"),
 }
 
-# The extra to name where a library that a verb lacks comes with several.
+# The extra to name for a verb where several extras contain the missing library.
 _EXTRA_OF: dict[str, str] = dict.fromkeys(
     ("train", "evaluate", "benchmark", "closed-loop", "frontier", "predict", "calibrate"), "train"
 )
 
 
 def build_app(called: str = "") -> App:
-    """The command line, no verb imported but `called`, whose docstring is its help text."""
+    """The command line. Only the verb `called` is imported: its docstring is its help text."""
     headings = [(Group.create_ordered(name), verbs) for name, verbs in _HEADINGS.items()]
     groups = {verb: group for group, verbs in headings for verb in verbs}
     app = App(
@@ -100,7 +100,7 @@ def build_app(called: str = "") -> App:
         print_error=False,
         exit_on_error=False,
         suppress_keyboard_interrupt=False,
-        # Every flag is off unless given, and there is none to turn it off.
+        # Every flag is off unless given, and has no negative form.
         default_parameter=Parameter(
             negative=(), show_default=lambda value: None if value is False else value
         ),
@@ -111,7 +111,7 @@ def build_app(called: str = "") -> App:
 
 
 def _usage_line(error: CycloptsError) -> str:
-    """One line for a wrong command line; unknown verbs are answered without loading the known ones."""
+    """One line for a wrong command line; for an unknown verb, no verb is imported."""
     error.verbose = False
     words = ["datagen", *(error.command_chain or ())]
     verb, see = " ".join(words), f"See: {' '.join(words)} --help"
@@ -135,7 +135,7 @@ def _usage_line(error: CycloptsError) -> str:
 
 
 def _help_of(argument: Argument, verb: Callable[..., Any] | None) -> str:
-    """The help of an option; that of a docstring is not in what an error carries."""
+    """The help of an option, from the verb's docstring; the argument of an error has none."""
     app = App()
     app.default(verb)
     documented = app.assemble_argument_collection(parse_docstring=True)

@@ -72,11 +72,11 @@ def relabelled_specification(
     `options` are dotted names. InputError for another label source, for a configuration that would change
     more than the rule, and for visibilities from another version of the label code.
     """
-    before, place = source.manifest.spec, source.storage.url
+    before, path = source.manifest.spec, source.storage.url
     if before.label_source != "heuristic":
         problem = f"is {before.label_source}: such labels cannot be computed from distance and visibility"
-        fix = f"Relabel a heuristic run of these scenes: datagen submit heuristic --scenes-from {place}"
-        raise InputError(place, "label_source", problem, fix)
+        fix = f"Relabel a heuristic run of these scenes: datagen submit heuristic --scenes-from {path}"
+        raise InputError(path, "label_source", problem, fix)
     sources = source.manifest.sources
     stored = StoredScenes(source, sources.get("houses", "builtin"), sources.get("objects", "builtin"))
     spec = specify_again("heuristic", stored, config, options=options)
@@ -88,22 +88,22 @@ def relabelled_specification(
     if (made := before.engines.get("labels")) != version:
         problem = f"visibilities are of version {made} of the label code, not {version}"
         fix = "Cast rays again: datagen submit heuristic --scenes-from RUN"
-        raise InputError(place, "engines.labels", problem, fix)
+        raise InputError(path, "engines.labels", problem, fix)
     # rho and distance were computed with the source's versions, whatever is installed here.
     return spec.model_copy(update={"engines": dict(before.engines)})
 
 
 def relabel_all(
-    place: Storage, sources: Sequence[Run], specs: Sequence[Specification], json: bool = False
+    storage: Storage, sources: Sequence[Run], specs: Sequence[Specification], json: bool = False
 ) -> Relabelled:
-    """Relabel every committed shard of the runs that is missing at `place`, and seal.
+    """Relabel every committed shard of the runs that is missing in `storage`, and seal.
 
-    One specification gives a run, several give merged runs. InputError when something else is at `place`.
+    One specification gives a run, several give merged runs. InputError when `storage` holds something else.
     """
     for source in sources:
         if not source.committed():
             raise InputError(source.storage.url, "commits", "no shard is committed", "Resume the run first")
-    # Runs of the same scenes by different rules become one run: the longest represents them.
+    # Runs of the same scenes by different rules become one run, made from the longest.
     longest: dict[str, tuple[Run, Specification]] = {}
     for source, spec in zip(sources, specs, strict=True):
         found = longest.get(spec.hash())
@@ -112,12 +112,12 @@ def relabel_all(
     pairs = [longest[spec_hash] for spec_hash in sorted(longest)]
     done = Relabelled()
     if len(pairs) > 1:
-        _refuse_other_place(place, sorted(longest))
+        _refuse_other_runs(storage, sorted(longest))
     for source, spec in pairs:
-        below = place if len(pairs) == 1 else place.below(part_folder(spec.hash()))
+        below = storage if len(pairs) == 1 else storage.below(part_folder(spec.hash()))
         done.runs.append(_open_target(below, source, spec))
     if len(pairs) > 1:
-        _write_merged(place, sorted(longest))
+        _write_merged(storage, sorted(longest))
     stop = StopRequest()
     with stop_on_signals(stop, interrupt=True), Progress(json) as shown:
         for run, (source, _) in zip(done.runs, pairs, strict=True):
@@ -126,50 +126,50 @@ def relabel_all(
             done.absent += len(planned) - len(missing)
             done.summary = done.summary.plus(_relabel_run(run, source, missing, stop, done.flips, shown))
     if done.summary.end in ("complete", "failed") and any(run.committed() for run in done.runs):
-        seal(place)
+        seal(storage)
     return done
 
 
-def _open_target(place: Storage, source: Run, spec: Specification) -> Run:
+def _open_target(storage: Storage, source: Run, spec: Specification) -> Run:
     known = source.manifest.sources
     manifest = manifest_of(
         spec, source.layout, {**known, "scenes_from": source.storage.url}, source.manifest.schema_version
     )
-    run = Run.create_or_open(place, manifest, source.n)
+    run = Run.create_or_open(storage, manifest, source.n)
     if run.layout != source.layout:
         problem = f"is {run.layout.scenes_per_shard}, unlike in the source"
         fix = "Choose another --out: files can be shared only shard by shard"
-        raise InputError(f"{place.url}/manifest.json", "layout.scenes_per_shard", problem, fix)
+        raise InputError(f"{storage.url}/manifest.json", "layout.scenes_per_shard", problem, fix)
     return run
 
 
-def _refuse_other_place(place: Storage, hashes: Sequence[str]) -> None:
-    """Raise InputError where a place holds anything but these runs, before a part is started."""
-    if place.exists("manifest.json"):
+def _refuse_other_runs(storage: Storage, hashes: Sequence[str]) -> None:
+    """Raise InputError where the storage holds anything but these runs, before a part is started."""
+    if storage.exists("manifest.json"):
         problem = f"holds one run, but {len(hashes)} would be written"
-        raise InputError(place.url, "manifest.json", problem, "Choose another --out")
-    stored = place.get(MERGED, MAX_RECORD_BYTES)
+        raise InputError(storage.url, "manifest.json", problem, "Choose another --out")
+    stored = storage.get(MERGED, MAX_RECORD_BYTES)
     if stored is None:
         # An interrupted call may have left parts, and a draft of the record.
-        refuse_foreign(place, "parts/", MERGED)
+        refuse_foreign(storage, "parts/", MERGED)
     elif stored != _merged_record(hashes):
-        raise _other_runs(place)
+        raise _other_runs(storage)
 
 
 def _merged_record(hashes: Sequence[str]) -> bytes:
     return encode_record(Merged(parts=tuple(hashes)))
 
 
-def _other_runs(place: Storage) -> InputError:
-    return InputError(f"{place.url}/{MERGED}", "parts", "has other merged runs", "Choose another --out")
+def _other_runs(storage: Storage) -> InputError:
+    return InputError(f"{storage.url}/{MERGED}", "parts", "has other merged runs", "Choose another --out")
 
 
-def _write_merged(place: Storage, hashes: Sequence[str]) -> None:
+def _write_merged(storage: Storage, hashes: Sequence[str]) -> None:
     record = _merged_record(hashes)
-    if place.get(MERGED, MAX_RECORD_BYTES) in (None, record):
-        publish(place, MERGED, record)
-    if place.get(MERGED, MAX_RECORD_BYTES) != record:  # also where another process was faster
-        raise _other_runs(place)
+    if storage.get(MERGED, MAX_RECORD_BYTES) in (None, record):
+        publish(storage, MERGED, record)
+    if storage.get(MERGED, MAX_RECORD_BYTES) != record:  # also where another process wrote first
+        raise _other_runs(storage)
 
 
 def _relabel_run(

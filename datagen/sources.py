@@ -1,4 +1,4 @@
-"""What runs can be made of, by name: label sources, houses, objects and robots."""
+"""Registries of label sources, houses, objects and robots, by name."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ T = TypeVar("T")
 
 
 class Registry(Generic[T]):
-    """Names, and what each stands for, loaded when it is asked for.
+    """Names, each with an object that is loaded on access.
 
-    `list(registry)` has the names; `registry[name]` loads one, and an unknown name raises InputError that
-    lists the valid ones.
+    `list(registry)` gives the names, and `registry[name]` loads one. An unknown name raises InputError with
+    the valid ones.
 
     Example:
         >>> list(datagen.robots)

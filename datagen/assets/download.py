@@ -23,7 +23,7 @@ from datagen.schemas.untrusted_files import read_regular
 _CHUNK_BYTES = 2**18
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(?:\d+|\*)")
 # Responses worth a retry; other 4xx are final.
-_PASSING = {408, 425, 429, 500, 502, 503, 504}
+_TRANSIENT = {408, 425, 429, 500, 502, 503, 504}
 
 # (bytes here so far, total or None). Also called when a download starts over.
 Progress = Callable[[int, int | None], None]
@@ -199,7 +199,7 @@ def _transfer(
         if error.code == 416:
             part.discard()
             raise _TransientFailure("the server refused to continue") from error
-        if error.code in _PASSING:
+        if error.code in _TRANSIENT:
             raise _TransientFailure(f"HTTP {error.code}") from error
         raise InputError(
             url,
@@ -223,7 +223,7 @@ def _content_length(answer: Any) -> int | None:
 
 
 def _validator(answer: Any) -> str:
-    """A strong ETag or else the modification time: what If-Range accepts."""
+    """The validator for If-Range: a strong ETag, or else the modification time."""
     etag = answer.headers.get("ETag", "")
     return etag if etag and not etag.startswith("W/") else answer.headers.get("Last-Modified", "")
 

@@ -72,10 +72,10 @@ def fetch(
 
 
 def refuse_full_disk(assets: Sequence[CatalogueEntry], folder: Path) -> None:
-    """InputError where the disk has no room for the known sizes."""
+    """Raise InputError where the disk has no room for the known sizes."""
     known = sum(asset.size or 0 for asset in assets)
-    place = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
-    free = shutil.disk_usage(place).free
+    existing = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
+    free = shutil.disk_usage(existing).free
     if known > free:
         raise InputError(
             folder,

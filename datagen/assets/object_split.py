@@ -1,6 +1,6 @@
-"""Divide a YCB folder into objects that models are trained on, and every fifth, which they never see.
+"""Divide a YCB folder into training objects and, every fifth object, test objects.
 
-Objects are taken in the order of their keys, so that the same folder gives the same two.
+Objects are divided in the order of their keys, so that the same folder always gives the same two parts.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def split_objects(source: Path, out: Path) -> dict[Part, int]:
 
 
 def _read(source: Path) -> list[dict[str, Any]]:
-    """The entries of the index, whose keys differ and whose files lie in the folder."""
+    """The entries of the index, checked: keys are unique, and files are in the folder."""
     index = source / INDEX
     data = read_regular(index, _MOST_BYTES, "Name a folder of YCB objects that has one")
     try:
@@ -50,7 +50,7 @@ def _read(source: Path) -> list[dict[str, Any]]:
     for number, entry in enumerate(entries):
         key, files = (entry.get(name) if isinstance(entry, dict) else None for name in ("key", "files"))
         if not isinstance(key, str) or key in keys:
-            raise InputError(index, f"[{number}].key", "is not a name of its own", _FIX)
+            raise InputError(index, f"[{number}].key", "is not a unique name", _FIX)
         keys.add(key)
         if not isinstance(files, dict) or not files:
             raise InputError(index, f"[{number}].files", "names no files", _FIX)

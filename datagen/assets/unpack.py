@@ -17,7 +17,7 @@ from datagen.schemas.archives import DAMAGED_ZIP, open_member
 from datagen.schemas.errors import InputError
 
 _CHUNK_BYTES = 2**20
-# zipfile reads its list of members at once, tarfile a header's extension, which may hold another one.
+# zipfile reads its list of members at once; tarfile reads a header's extension, which may have its own.
 _ZIP_LIST = 16 * 2**20
 _ADVICE = "Do not use this archive; fetch it from its publisher"
 
@@ -88,8 +88,8 @@ def _members(archive: Path, limits: Limits) -> Iterator[_Member]:
         packed = raw.read(2) == b"\x1f\x8b"
         raw.seek(0)
         plain: Any = gzip.GzipFile(fileobj=raw) if packed else raw
-        careful: Any = _Careful(archive, plain, _CHUNK_BYTES)
-        with tarfile.open(fileobj=careful, mode="r:") as tar:
+        bounded: Any = _BoundedStream(archive, plain, _CHUNK_BYTES)
+        with tarfile.open(fileobj=bounded, mode="r:") as tar:
             for count, info in enumerate(tar):
                 if count > 2 * limits.files:
                     raise InputError(archive, "", f"has more than {2 * limits.files:,} entries", _ADVICE)
@@ -108,7 +108,7 @@ def _members(archive: Path, limits: Limits) -> Iterator[_Member]:
 def _zip_members(archive: Path, limits: Limits) -> Iterator[_Member]:
     with (
         archive.open("rb") as raw,
-        zipfile.ZipFile(cast(IO[bytes], _Careful(archive, raw, _ZIP_LIST))) as packed,
+        zipfile.ZipFile(cast(IO[bytes], _BoundedStream(archive, raw, _ZIP_LIST))) as packed,
     ):
         claimed = sum(info.file_size for info in packed.infolist())
         if claimed > limits.total_bytes:
@@ -164,7 +164,7 @@ def _refuse_links(archive: Path, folder: Path, relative: PurePosixPath) -> None:
             raise InputError(archive, str(relative), f"{step} is a link", "Remove it or use an empty folder")
 
 
-class _Careful:
+class _BoundedStream:
     """A readable, seekable stream that refuses huge single reads."""
 
     def __init__(self, archive: Path, stream: Any, largest: int) -> None:

@@ -1,1 +1,1 @@
-"""The frozen benchmark: runs that everybody makes alike, and one evaluation of every method on them."""
+"""The frozen benchmark: reproducible runs, and one evaluation of every method on them."""

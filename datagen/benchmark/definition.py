@@ -1,7 +1,7 @@
 """The definition of a benchmark: a version, and the specification and digests of each of its runs.
 
-`benchmark.json` in this folder is the one that the package ships. `scripts/freeze_benchmark.py` writes the
-digests of complete runs into it.
+The package ships `benchmark.json` in this folder. `scripts/freeze_benchmark.py` writes the digests of
+complete runs into it.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ class RunDigests(StoredRecord):
 
 
 class BenchmarkRun(StoredRecord):
-    """One run: what it asks of a method, which objects it is made from, and its frozen content.
+    """One run: its description, objects, size, specification and frozen digests.
 
     `objects` is a part of the objects as `datagen assets split` divides them, or all of them. `digests` is
-    None until the run was made and frozen.
+    None until the run is made and frozen.
     """
 
     about: Annotated[str, Field(min_length=1, max_length=200)]
@@ -77,12 +77,12 @@ class Benchmark(StoredRecord):
 
 def read_benchmark(path: Path | None = None) -> Benchmark:
     """The definition in a file, by default the shipped one. InputError names the first wrong field."""
-    place = path or SHIPPED
-    data = read_regular(place, _MOST_BYTES, "Omit --benchmark for the one that the package ships")
+    file = path or SHIPPED
+    data = read_regular(file, _MOST_BYTES, "Omit --benchmark for the one that the package ships")
     try:
         return Benchmark.model_validate_json(data)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         fix = "Restore the file, or write it again: scripts/freeze_benchmark.py"
-        raise InputError(place, where, first["msg"], fix) from None
+        raise InputError(file, where, first["msg"], fix) from None

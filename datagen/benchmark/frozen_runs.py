@@ -1,4 +1,4 @@
-"""Hold a run's folder against the definition: specification, size, candidates and labels."""
+"""Compare a run's folder with the definition: specification, size, candidates and labels."""
 
 from __future__ import annotations
 
@@ -15,42 +15,42 @@ _FIELDS = ("sample_id", "label")
 _MOST_SHOWN = 5
 
 
-def digests_of(place: str | Path) -> RunDigests:
-    """The digests of a complete run, or of its sealed store: the same for copies of it."""
+def digests_of(path: str | Path) -> RunDigests:
+    """The digests of a complete run or of its sealed store; copies have the same digests."""
     candidates, labels = hashlib.sha256(), hashlib.sha256()
-    for columns in SampleReader([place], (), _FIELDS).shards():
+    for columns in SampleReader([path], (), _FIELDS).shards():
         candidates.update(columns["sample_id"].tobytes())
         labels.update(columns["label"].astype("u1").tobytes())
     return RunDigests(candidates=candidates.hexdigest(), labels=labels.hexdigest())
 
 
-def refuse_differing(place: str, name: str, wanted: BenchmarkRun, version: str) -> None:
-    """Raise InputError, with all that differs, for a run that is not the benchmark's.
+def refuse_differing(path: str, name: str, wanted: BenchmarkRun, version: str) -> None:
+    """Raise InputError with the differences from the benchmark's run.
 
-    Digests are compared where the run is frozen.
+    Digests are compared if the definition has them.
     """
-    whose = f"run {name} of benchmark {version}"
+    definition = f"run {name} of benchmark {version}"
     fix = f"Make it with `datagen benchmark make --run {name}`, or copy the run"
-    parts = open_parts([place], _FIELDS)
+    parts = open_parts([path], _FIELDS)
     for part in parts:
         ours, theirs = (s.model_dump(mode="json") for s in (wanted.spec, part.specs[0]))
         if rows := different_fields(ours, theirs):
-            shown = [f"{field} is {b!r}, but {a!r} in {whose}" for field, a, b in rows[:_MOST_SHOWN]]
+            shown = [f"{field} is {b!r}, but {a!r} in {definition}" for field, a, b in rows[:_MOST_SHOWN]]
             more = f"; and {len(rows) - _MOST_SHOWN} more" if len(rows) > _MOST_SHOWN else ""
-            raise InputError(place, "specification", "; ".join(shown) + more, fix)
+            raise InputError(path, "specification", "; ".join(shown) + more, fix)
     samples = sum(shard.samples for part in parts for shard in part.shards)
     if samples != wanted.n:
-        raise InputError(place, "labels", f"are {samples:,}, but {wanted.n:,} in {whose}", fix)
+        raise InputError(path, "labels", f"are {samples:,}, but {wanted.n:,} in {definition}", fix)
     if wanted.digests is None:
         return
-    found = digests_of(place)
+    found = digests_of(path)
     differing = [
-        f"{what} have the digest {ours[:12]}, but {theirs[:12]} in {whose}"
-        for what, ours, theirs in (
+        f"{column} have the digest {ours[:12]}, but {theirs[:12]} in {definition}"
+        for column, ours, theirs in (
             ("candidates", found.candidates, wanted.digests.candidates),
             ("labels", found.labels, wanted.digests.labels),
         )
         if ours != theirs
     ]
     if differing:
-        raise InputError(place, "", "; ".join(differing), fix)
+        raise InputError(path, "", "; ".join(differing), fix)

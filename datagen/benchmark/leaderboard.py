@@ -30,9 +30,9 @@ def leaderboard(
     resamples: int,
     seed: int,
 ) -> dict[str, Any]:
-    """All numbers; `gathered` has the runs in the order of `runs`.
+    """All numbers of the leaderboard; `gathered` has the runs in the order of `runs`.
 
-    Sampled candidates within reach give decisions, grids give picks. Values are None where undefined.
+    Runs of sampled candidates test decisions, runs of whole grids test picks. Undefined values are None.
     """
     judged = [each.method for each in methods]
     parts = {name: gathered.columns.of_scenes(gathered.columns.run == k) for k, name in enumerate(runs)}
@@ -54,7 +54,7 @@ def leaderboard(
         },
         "datagen": __version__,
         "bootstrap": {"resamples": resamples, "seed": seed, "level": LEVEL, "by": "scene"},
-        "fitted_on": [Path(place).name for place in fit],
+        "fitted_on": [Path(path).name for path in fit],
         "methods": [_record(each, gathered) for each in methods],
         "candidates": {name: _decisions(part, judged, resamples, seed) for name, part in sampled.items()},
         "grids": {name: _picks(part, judged, resamples, seed) for name, part in whole.items()},
@@ -62,33 +62,35 @@ def leaderboard(
 
 
 def _record(method: EvaluatedMethod, gathered: Gathered) -> dict[str, Any]:
-    """A method's entry: of a checkpoint its file's name and digests, no path of this machine."""
+    """A method's entry. It names a checkpoint by its file name and digests, not by its path."""
     record = method.record()
-    told = {key: record[key] for key in ("name", "regime", "threshold", "note")}
-    told["seconds_per_600"] = gathered.seconds[method.name] * 600 / len(gathered.columns)
+    entry = {key: record[key] for key in ("name", "regime", "threshold", "note")}
+    entry["seconds_per_600"] = gathered.seconds[method.name] * 600 / len(gathered.columns)
     checkpoint = record["checkpoint"]
     if checkpoint is not None:
         kept = ("sha256", "model", "config", "stage", "best_epoch")
-        told["checkpoint"] = {key: checkpoint[key] for key in kept}
-        told["checkpoint"]["file"] = Path(checkpoint["place"]).name
+        entry["checkpoint"] = {key: checkpoint[key] for key in kept}
+        entry["checkpoint"]["file"] = Path(checkpoint["place"]).name
         assert isinstance(method.scorer, ModelScorer)
-        told["checkpoint"]["weights_sha256"] = weights_sha256(method.scorer.model)
-    return told
+        entry["checkpoint"]["weights_sha256"] = weights_sha256(method.scorer.model)
+    return entry
 
 
 def _decisions(columns: Columns, methods: Sequence[Method], resamples: int, seed: int) -> dict[str, Any]:
     """Decisions on the candidates within reach: METRICS with intervals, and calibration."""
     weights = weights_for(columns, resamples, seed)
-    told = evaluate_set(columns, methods, CANDIDATES, weights)
-    rate = told["positives"] / told["count"]
+    scores = evaluate_set(columns, methods, CANDIDATES, weights)
+    rate = scores["positives"] / scores["count"]
     kept = (*METRICS, "expected_calibration_error", "brier")
     return {
-        "candidates": told["count"],
-        "scenes": told["scenes"],
+        "candidates": scores["count"],
+        "scenes": scores["scenes"],
         "positive_rate": rate,
         "base_rate": max(rate, 1 - rate),
-        "methods": {name: {key: said[key] for key in kept} for name, said in told["methods"].items()},
-        "differences": [d for d in told["comparisons"] if d["kind"] == "best" and d["metric"] in METRICS[:2]],
+        "methods": {name: {key: values[key] for key in kept} for name, values in scores["methods"].items()},
+        "differences": [
+            d for d in scores["comparisons"] if d["kind"] == "best" and d["metric"] in METRICS[:2]
+        ],
     }
 
 
@@ -104,10 +106,10 @@ def _picks(columns: Columns, methods: Sequence[Method], resamples: int, seed: in
             found[name] = None
             continue
         weights = weights_for(part, resamples, seed)
-        told = evaluate_grids(part, methods, weights)
+        scores = evaluate_grids(part, methods, weights)
         found[name] = {
-            **{key: told[key] for key in ("scenes", "clear_per_scene", "positives_per_scene", "any_clear")},
-            "methods": told["methods"],
+            **{key: scores[key] for key in ("scenes", "clear_per_scene", "positives_per_scene", "any_clear")},
+            "methods": scores["methods"],
             "arrivals": arrival_table(part, methods, weights),
         }
     return found

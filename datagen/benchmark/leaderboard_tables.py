@@ -22,36 +22,36 @@ Report = Mapping[str, Any]
 
 def tables(report: Report) -> Iterator[TitledTable]:
     """All tables, decisions first."""
-    for name, told in report["candidates"].items():
-        yield decisions_table(report, name, told)
-        yield from differences_table(name, told)
-    for name, told in report["grids"].items():
+    for name, scores in report["candidates"].items():
+        yield decisions_table(report, name, scores)
+        yield from differences_table(name, scores)
+    for name, scores in report["grids"].items():
         for which in ("mixed", "hard"):
-            if told[which] is not None:
-                yield picks_table(report, name, which, told[which])
-                yield arrivals_table(report, name, which, told[which])
+            if scores[which] is not None:
+                yield picks_table(report, name, which, scores[which])
+                yield arrivals_table(report, name, which, scores[which])
 
 
-def decisions_table(report: Report, name: str, told: Report) -> TitledTable:
+def decisions_table(report: Report, name: str, scores: Report) -> TitledTable:
     """Balanced accuracy and AUC, calibration, and raw accuracy last, with its base rate."""
     rows = [
-        (method, with_interval(said["balanced_accuracy"]), with_interval(said["area_under_roc"]),
-         percent(said["expected_calibration_error"]), with_interval(said["accuracy"]))
-        for method, said in told["methods"].items()
+        (method, with_interval(values["balanced_accuracy"]), with_interval(values["area_under_roc"]),
+         percent(values["expected_calibration_error"]), with_interval(values["accuracy"]))
+        for method, values in scores["methods"].items()
     ]  # fmt: skip
-    rows.append(("the commoner label", "50.0", "50.0", "-", percent(told["base_rate"])))
+    rows.append(("the commoner label", "50.0", "50.0", "-", percent(scores["base_rate"])))
     heads = ("method", "balanced accuracy (%)", "AUC (%)", "calibration error (%)", "accuracy (%)")
-    about, rate = report["benchmark"]["runs"][name]["about"], percent(told["positive_rate"])
-    counts = f"{told['candidates']:,} candidates within reach of {told['scenes']:,} scenes"
+    about, rate = report["benchmark"]["runs"][name]["about"], percent(scores["positive_rate"])
+    counts = f"{scores['candidates']:,} candidates within reach of {scores['scenes']:,} scenes"
     title = f"{name}: {about}; {counts}, {rate}% good"
     return TitledTable(title, heads, rows)
 
 
-def differences_table(name: str, told: Report) -> Iterator[TitledTable]:
+def differences_table(name: str, scores: Report) -> Iterator[TitledTable]:
     """The best model minus the best baseline; nothing without both."""
     rows = [
         (f"{d['first']} - {d['second']}", METRIC_WORDS[d["metric"]], with_interval(d, signed=True))
-        for d in told["differences"]
+        for d in scores["differences"]
     ]
     if rows:
         yield TitledTable(
@@ -61,25 +61,25 @@ def differences_table(name: str, told: Report) -> Iterator[TitledTable]:
         )
 
 
-def picks_table(report: Report, name: str, which: str, told: Report) -> TitledTable:
+def picks_table(report: Report, name: str, which: str, scores: Report) -> TitledTable:
     """How often the best-scored clear cell is good, and how far off it is otherwise."""
     rows = [
-        (method, with_interval(said["good"]), metres_with_interval(said["missed_m"]),
-         with_interval(said["mean_average_precision"]))
-        for method, said in told["methods"].items()
+        (method, with_interval(values["good"]), metres_with_interval(values["missed_m"]),
+         with_interval(values["mean_average_precision"]))
+        for method, values in scores["methods"].items()
     ]  # fmt: skip
-    rows.append(("any clear cell", percent(told["any_clear"]), "-", percent(told["any_clear"])))
+    rows.append(("any clear cell", percent(scores["any_clear"]), "-", percent(scores["any_clear"])))
     heads = ("method", "best cell good (%)", "else missed by (m)", "mAP (%)")
-    return TitledTable(_grids_title(report, name, which, told), heads, rows)
+    return TitledTable(_grids_title(report, name, which, scores), heads, rows)
 
 
-def arrivals_table(report: Report, name: str, which: str, told: Report) -> TitledTable:
-    """Success of each method's pick where the robot parks off it."""
-    found = told["arrivals"]
+def arrivals_table(report: Report, name: str, which: str, scores: Report) -> TitledTable:
+    """Success of each method's pick when the robot parks with a position error."""
+    found = scores["arrivals"]
     rows = [
         (method if pick == PICKS[0] else "", pick,
          *(percent(row["methods"][method][pick]["value"]) for row in found))
-        for method in told["methods"]
+        for method in scores["methods"]
         for pick in PICKS
     ]  # fmt: skip
     rows += [
@@ -90,32 +90,30 @@ def arrivals_table(report: Report, name: str, which: str, told: Report) -> Title
     return TitledTable(title, ("method", "pick", *(row["arrival"] for row in found)), rows)
 
 
-def _grids_title(report: Report, name: str, which: str, told: Report) -> str:
+def _grids_title(report: Report, name: str, which: str, scores: Report) -> str:
     words = (
         "good and bad clear cells"
         if which == "mixed"
         else f"at most {HARD_SHARE:.0%} of the clear cells good"
     )
     about = report["benchmark"]["runs"][name]["about"]
-    return f"{name}, {which}: {about}; {told['scenes']:,} grids with {words}"
+    return f"{name}, {which}: {about}; {scores['scenes']:,} grids with {words}"
 
 
 def facts(report: Report) -> list[tuple[str, str]]:
-    """What was scored, on which benchmark, and what a reader must know of it."""
+    """Facts about the leaderboard: benchmark, runs, intervals, and notes on the methods."""
     benchmark, boot = report["benchmark"], report["bootstrap"]
     found = [("benchmark", f"version {benchmark['version']}, {benchmark['digest'][:12]}")]
     for name, run in benchmark["runs"].items():
         digests = run["digests"]
-        told = f"specification {run['spec_hash'][:12]}"
+        text = f"specification {run['spec_hash'][:12]}"
         if digests is None:
-            told += "; not frozen: its candidates and labels were not compared"
+            text += "; not frozen: its candidates and labels were not compared"
         else:
-            told += f", candidates {digests['candidates'][:12]}, labels {digests['labels'][:12]}"
-        found.append((f"run {name}", told))
+            text += f", candidates {digests['candidates'][:12]}, labels {digests['labels'][:12]}"
+        found.append((f"run {name}", text))
     if benchmark["not_scored"]:
-        found.append(
-            ("not scored", f"{', '.join(benchmark['not_scored'])}: this is no whole line of a leaderboard")
-        )
+        found.append(("not scored", f"{', '.join(benchmark['not_scored'])}: every row is incomplete"))
     found.append(
         ("intervals",
          f"{100 * boot['level']:g}% by {boot['resamples']:,} resamples of scenes, seed {boot['seed']}")
@@ -125,8 +123,8 @@ def facts(report: Report) -> list[tuple[str, str]]:
         found.append(("baselines", f"fitted on {', '.join(report['fitted_on'])}"))
     for method in report["methods"]:
         if checkpoint := method.get("checkpoint"):
-            told = f"{checkpoint['model']} ({method['regime']}), weights {checkpoint['weights_sha256'][:12]}"
-            found.append((method["name"], told))
+            text = f"{checkpoint['model']} ({method['regime']}), weights {checkpoint['weights_sha256'][:12]}"
+            found.append((method["name"], text))
         elif method["note"]:
             found.append((method["name"], method["note"]))
         if method["threshold"] is None:

@@ -1,4 +1,4 @@
-"""Make the runs of a benchmark from the houses and objects that it names, by the ordinary jobs."""
+"""Make the runs of a benchmark with ordinary jobs, from the houses and objects that it names."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class BenchmarkSources:
 def divided_sources(
     houses: str, objects: str, out: Path, runs: Mapping[str, BenchmarkRun]
 ) -> BenchmarkSources:
-    """Divide the objects into OUT/objects where a run asks for a part of them.
+    """Return the sources of `runs`; split the objects into OUT/objects if a run uses a part of them.
 
-    InputError where they are no folder that can be divided.
+    InputError for objects that are no folder with an objects.json.
     """
     parts = {"all": absolute_source(objects)}
     if any(run.objects != "all" for run in runs.values()):
@@ -58,10 +58,10 @@ def make_runs(
     job_options: JobOptions,
     words: list[str],
 ) -> Iterator[JobResult]:
-    """Make each run in its folder of `out`, and give what was done; a complete one is left as it is.
+    """Make each run in its folder of `out` and yield the result of its job; complete runs do not change.
 
-    InputError, before a run is begun, where the houses, objects or engines here are others than the
-    definition's: the labels would differ.
+    InputError, before the first job starts, if houses, objects or engines differ from the definition's: the
+    labels would differ too.
     """
     planned: list[PlannedRun] = []
     with opening(words, job_options) as began_s:
@@ -85,10 +85,10 @@ def make_runs(
         )
 
 
-def _planned(place: Path, manifest: Manifest, n: int, houses: str, objects: str) -> PlannedRun:
-    """The shards that the run there, or a new one, lacks. InputError for another run there."""
-    if not (place / "manifest.json").is_file():
+def _planned(folder: Path, manifest: Manifest, n: int, houses: str, objects: str) -> PlannedRun:
+    """The missing shards of the run in a folder, or of a new run. InputError for another run there."""
+    if not (folder / "manifest.json").is_file():
         return PlannedRun(manifest, None, n, manifest.layout.shards_for(n), houses, objects)
-    run = Run.open(place)
+    run = Run.open(folder)
     refuse_other(run.storage.url, run.manifest, manifest)
     return planned_run(JobRun(run, houses, objects), n)

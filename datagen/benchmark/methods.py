@@ -24,8 +24,7 @@ def open_methods(
 ) -> list[EvaluatedMethod]:
     """The methods, in the order in which they are named.
 
-    InputError for one that is nothing of these, that is named twice, or that was trained on a house or an
-    object which the benchmark holds out.
+    InputError for an unknown method, for two methods of one name, and where `fit` and `runs` share a house.
     """
     kinds = {each: _kind(each) for each in named}
     checkpoints = [each for each, kind in kinds.items() if kind == "checkpoint"]
@@ -44,15 +43,15 @@ def open_methods(
             found[each] = EvaluatedMethod(
                 file.name,
                 file,
-                file.place,
+                file.path,
                 note="scores of a file",
-                gives_probabilities=file.says_probabilities,
+                gives_probabilities=file.gives_probabilities,
             )
         elif kind == "python":
             Progress(json).say("note", {"note": f"{_RUNS} {each}"}, f"{_RUNS} {each}")
             scorer = import_scorer(each)
             found[each] = EvaluatedMethod(
-                each, scorer, each, note=f"{_RUNS} {each}", gives_probabilities=scorer.says_probabilities
+                each, scorer, each, note=f"{_RUNS} {each}", gives_probabilities=scorer.gives_probabilities
             )
     methods = [found[each] for each in kinds]
     for name, count in Counter(method.name for method in methods).items():
@@ -79,7 +78,7 @@ def _kind(named: str) -> str:
 
 
 def refuse_trained_objects(
-    place: str, run: EvaluatedRun, methods: Sequence[EvaluatedMethod], held_out: bool
+    path: str, run: EvaluatedRun, methods: Sequence[EvaluatedMethod], held_out: bool
 ) -> None:
     """Raise InputError for a model that was trained on an object of a run whose objects are held out."""
     if not held_out:
@@ -90,6 +89,4 @@ def refuse_trained_objects(
             problem = (
                 f"{method.name} was trained on {len(shared)} of the {len(here)} objects that it holds out"
             )
-            raise InputError(
-                place, "object_digest", problem, "Train on OUT/objects/train of `benchmark make`"
-            )
+            raise InputError(path, "object_digest", problem, "Train on OUT/objects/train of `benchmark make`")

@@ -22,21 +22,25 @@ REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 class PythonScorer:
     """A user's function from a batch without labels to scores (N,); 0 where the base is not clear.
 
-    The function's attribute `threshold`, if it has one, says from which score on a candidate is called good;
-    without it scores are probabilities and the threshold is 0.5.
+    The function's attribute `threshold`, if it has one, is the lowest score that counts as good. Without it
+    scores are probabilities and the threshold is 0.5.
     """
 
     name: str
     function: Callable[[Batch[Array]], Any]
     threshold: float
-    says_probabilities: bool
+    gives_probabilities: bool
 
     def score(self, batch: Batch[Array]) -> F64:
         """The function's scores. InputError where they are no probabilities and no threshold is stated."""
         clear = is_clear(batch)
         given = replace(batch, label=np.zeros_like(batch.label), extra={"base_is_clear": clear})
         score = np.asarray(self.function(given), np.float64)
-        if self.says_probabilities and score.shape == clear.shape and not ((score >= 0) & (score <= 1)).all():
+        if (
+            self.gives_probabilities
+            and score.shape == clear.shape
+            and not ((score >= 0) & (score <= 1)).all()
+        ):
             fix = "Return numbers from 0 to 1, or set the function's attribute `threshold`"
             raise InputError(self.name, "score", "is no probability, and no threshold is stated", fix)
         return np.where(clear, score, 0.0) if score.shape == clear.shape else score

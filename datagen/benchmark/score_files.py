@@ -1,7 +1,7 @@
 """Scores from a CSV file: an id and a score a line, made by any program.
 
-The first line is `sample_id,score`. Before it, `# threshold: NUMBER` says from which score on a candidate is
-called good. Without that line scores are probabilities, and the threshold is 0.5.
+The first line is `sample_id,score`. A line `# threshold: NUMBER` before it gives the lowest score that counts
+as good. Without that line scores are probabilities, and the threshold is 0.5.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class ScoreFile:
     """A scorer that looks scores up by sample id. Candidates that are not clear need none."""
 
     name: str
-    place: str
+    path: str
     threshold: float
-    says_probabilities: bool
+    gives_probabilities: bool
     scores: dict[bytes, float]
 
     def score(self, batch: Batch[Array]) -> F64:
@@ -44,13 +44,13 @@ class ScoreFile:
             key = batch.sample_id[row].tobytes()
             if (score := self.scores.get(key)) is None:
                 fix = "Score every clear candidate (base_is_clear) of every run"
-                raise InputError(self.place, "sample_id", f"has no score for {key.hex()}", fix)
+                raise InputError(self.path, "sample_id", f"has no score for {key.hex()}", fix)
             found[row] = score
         return found
 
 
 def read_scores(path: Path) -> ScoreFile:
-    """Read the file. InputError names the line of the first that is wrong."""
+    """Read the file. InputError names the first wrong line."""
     data = read_regular(path, _MOST_BYTES, "Name a CSV file of scores")
     try:
         text = data.decode("utf-8-sig")

@@ -1,1 +1,1 @@
-"""The closed loop: robots are sent to the picks of methods, arrive off them, plan from there, and execute."""
+"""The closed loop: robots are sent to methods' picks, arrive with an error, plan from there, and execute."""

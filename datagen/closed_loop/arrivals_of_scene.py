@@ -1,6 +1,6 @@
 """Arrivals in one scene: planned, executed, and kept in a file, so that each is done once.
 
-An arrival is known by the candidate, the error, and the world that it is executed in. Its outcome depends on
+An arrival is identified by candidate, error, and the world that it is executed in. Its outcome depends on
 nothing else, so methods with the same pick share it, and no order or number of processes changes it.
 """
 
@@ -52,7 +52,7 @@ class Arrived(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Its name in the file of the scene."""
+        """The key of its outcome in the file of the scene."""
         return f"{self.candidate} {self.x_m:.6f} {self.y_m:.6f} {self.yaw_rad:.6f} {self.world}"
 
 
@@ -72,7 +72,7 @@ class SceneTask:
 
     @cached_property
     def path(self) -> Path:
-        """The file of outcomes: named by all that decides them, but the arrivals."""
+        """The file of outcomes, named after all that decides them except the arrivals."""
         arm = arrival_specification(self.spec, self.mode == SIM).arm
         assert arm is not None
         key = {
@@ -107,7 +107,7 @@ def read_outcomes(path: Path) -> dict[str, str]:
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(path, "outcomes", f"is damaged ({error!s:.100})", fix) from error
     if not isinstance(known, dict) or any(outcome not in OUTCOMES for outcome in known.values()):
-        raise InputError(path, "outcomes", "holds what is no outcome", fix)
+        raise InputError(path, "outcomes", "has an unknown outcome", fix)
     return known
 
 
@@ -152,8 +152,8 @@ def write_outcomes(path: Path, outcomes: Mapping[str, str]) -> None:
 
 
 @lru_cache(maxsize=1)
-def _opened(place: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, World]:
-    run = Run.open(place)
+def _opened(path: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, World]:
+    run = Run.open(path)
     if run.manifest.spec_hash != spec_hash:
-        raise InputError(place, "spec_hash", "the run now has another specification", "Start it again")
+        raise InputError(path, "spec_hash", "the run now has another specification", "Start it again")
     return run, open_world(run.manifest.spec, houses, objects)

@@ -1,4 +1,4 @@
-"""The closed loop of scored grids: arrivals to make, and the document of what they came to."""
+"""The closed loop of scored grids: arrivals to make, and the document of their outcomes."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Loop:
 
 
 def arrivals_of(given: Sequence[Arrival]) -> tuple[Arrival, ...]:
-    """The errors of a closed loop: those given, else 0 to 25 cm off with a yaw error in proportion."""
+    """The arrival errors of a closed loop: those given, else 0 to 25 cm with a yaw error in proportion."""
     return tuple(given) or tuple(ring_arrival(d, d * _YAW_RAD_PER_M) for d in DISTANCES_M)
 
 
@@ -74,7 +74,7 @@ def plan_loop(
     seed: int,
     folder: str,
 ) -> Loop:
-    """The loop over the whole grids of `columns`, `n` arrivals a scene, error and pick.
+    """The loop over the whole grids of `columns`, `n` arrivals per scene, error and pick.
 
     InputError where no scene has a whole grid with a good clear cell.
     """
@@ -108,12 +108,12 @@ def plan_loop(
 
 
 def _scenes_of(columns: Columns, runs: Sequence[EvaluatedRun], kept: I64) -> list[tuple[Run, int]]:
-    """The run, or the part of merged ones, and the index in it of these scenes; streams keep stored order."""
+    """The run, or part of merged runs, of each scene, and its index there; streams keep the stored order."""
     opened = [open_runs(run.place) for run in runs]
     starts = np.searchsorted(columns.run, np.arange(len(runs)))
     return [
-        find_scene(opened[place], scene - int(starts[place]))
-        for scene, place in zip(kept.tolist(), columns.run[kept].tolist(), strict=True)
+        find_scene(opened[row], scene - int(starts[row]))
+        for scene, row in zip(kept.tolist(), columns.run[kept].tolist(), strict=True)
     ]
 
 
@@ -167,7 +167,7 @@ def loop_record(
     resamples: int,
     seed: int,
 ) -> dict[str, Any]:
-    """The document of a loop whose arrivals are all made."""
+    """The JSON document of a loop whose arrivals are all made."""
     known = [read_outcomes(task.path) for task in loop.tasks]
     outcomes = {pick: _outcomes(loop, pick, known) for pick in loop.turns.cells}
     by_labels = {
@@ -219,7 +219,7 @@ def _outcomes(loop: Loop, pick: Pick, known: Sequence[Mapping[str, str]]) -> Nam
 def _agreement(
     loop: Loop, outcomes: Mapping[Pick, Names], by_labels: Mapping[Pick, tuple[F64, F64]]
 ) -> list[dict[str, Any]]:
-    """For each error, what the labels around say of the distinct arrivals, and what these came to."""
+    """For each error, the prediction of nearby labels for the distinct arrivals, and their outcomes."""
     found: list[dict[str, Any]] = []
     for e, arrival in enumerate(loop.arrivals):
         seen: dict[tuple[int, Arrived], tuple[bool, float, float]] = {}
@@ -227,8 +227,8 @@ def _agreement(
             nearest, bilinear = by_labels[pick]
             for k in range(len(loop.tasks)):
                 for d, arrived in enumerate(loop.arrived(pick, e, k)):
-                    said = float(nearest[e, k, d]), float(bilinear[e, k, d])
-                    seen[k, arrived] = (names[e, k, d] == "success", *said)
+                    predicted = float(nearest[e, k, d]), float(bilinear[e, k, d])
+                    seen[k, arrived] = (names[e, k, d] == "success", *predicted)
         made, near, between = np.array(list(seen.values()), np.float64).T
         found.append(
             {

@@ -33,10 +33,10 @@ def draw_loop(record: Mapping[str, Any], file: Path) -> None:
     looks = looks_of(record["methods"]) | _LOOKS
     for ax, pick in zip(panels, PICKS, strict=True):
         for k, (name, look) in enumerate(looks.items()):
-            # A choice at random does not look at scores, so that it is the same in both panels.
-            told = [row["methods"][name].get(pick, row["methods"][name]["nominal"]) for row in part["table"]]
+            # The random choice ignores scores: it is the same in both panels.
+            rates = [row["methods"][name].get(pick, row["methods"][name]["nominal"]) for row in part["table"]]
             x_cm = [100 * row["distance_m"] + _APART_CM * (k - len(looks) / 2) for row in part["table"]]
-            _draw_line(ax, x_cm, told, look, name)
+            _draw_line(ax, x_cm, rates, look, name)
         ax.set(title=_TITLES[pick], xlabel="distance of the arrival from the pick (cm)", ylim=(-2, 102))
         ax.grid(color="#e4e4e4", lw=0.7)
         ax.set_axisbelow(True)
@@ -49,10 +49,10 @@ def draw_loop(record: Mapping[str, Any], file: Path) -> None:
 
 
 def _draw_line(
-    ax: Axes, x_cm: Sequence[float], told: Sequence[Mapping[str, Any]], look: dict[str, Any], name: str
+    ax: Axes, x_cm: Sequence[float], rates: Sequence[Mapping[str, Any]], look: dict[str, Any], name: str
 ) -> None:
     order = np.argsort(x_cm, kind="stable")
-    x, y = np.array(x_cm)[order], np.array([100 * told[k]["value"] for k in order])
-    bounds = np.array([[told[k]["low"], told[k]["high"]] for k in order], np.float64).T * 100
+    x, y = np.array(x_cm)[order], np.array([100 * rates[k]["value"] for k in order])
+    bounds = np.array([[rates[k]["low"], rates[k]["high"]] for k in order], np.float64).T * 100
     bars = np.maximum([y - bounds[0], bounds[1] - y], 0)
     ax.errorbar(x, y, bars, **look, ms=6, mec="white", mew=0.5, elinewidth=0.8, capsize=2, label=plain(name))

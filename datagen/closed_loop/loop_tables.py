@@ -79,10 +79,10 @@ def _failures(record: Record, part: Record) -> TitledTable:
         (
             name,
             pick,
-            ", ".join(f"{cause} {percent(share)}" for cause, share in told["failures"].items()) or "none",
+            ", ".join(f"{cause} {percent(share)}" for cause, share in result["failures"].items()) or "none",
         )
         for name in shown_methods(record)
-        for pick, told in row["methods"][name].items()
+        for pick, result in row["methods"][name].items()
     ]
     return TitledTable(f"failures (% of arrivals, {row['arrival']})", ("method", "pick", "cause"), rows)
 
@@ -101,7 +101,7 @@ def _agreement(record: Record) -> TitledTable:
     ]
     heads = ("arrival", "distinct arrivals", "success (%)", "by nearest label (%)", "between labels (%)",
              "agree with nearest (%)")  # fmt: skip
-    return TitledTable("what the labels around each arrival say of it", heads, rows)
+    return TitledTable("agreement with the labels around each arrival", heads, rows)
 
 
 def _errors(part: Record) -> list[str]:

@@ -1,1 +1,1 @@
-"""The verbs of the command line: a file is a verb, or two that belong together."""
+"""The verbs of the command line: one file per verb, or per two that belong together."""

@@ -46,7 +46,7 @@ def audit(
     if map is not None:
         refuse_output(map, "--map", ".svg", ".png")
     given = read_prices(prices)
-    report = audit_runs([run for place in runs for run in open_runs(place)], candidates, given)
+    report = audit_runs([run for path in runs for run in open_runs(path)], candidates, given)
     if map is not None:
         if not report["pairs"]:
             fix = "Make a second run with --scenes-from, and name both"

@@ -9,10 +9,18 @@ from typing import Annotated, Any, Unpack
 from cyclopts import App, Parameter
 
 from datagen.console.command_lines import Interrupted, prints, words_of
-from datagen.console.options import AsJson, File, Place, Places, Whole, refuse_odd_draws, refuse_output
+from datagen.console.options import (
+    AsJson,
+    File,
+    PathOrAddress,
+    PathsOrAddresses,
+    Whole,
+    refuse_odd_draws,
+    refuse_output,
+)
 from datagen.console.printing import print_json, print_rows
 from datagen.jobs.job_report import JobResult, print_job
-from datagen.jobs.options import JobKeywords, JobOptions, absolute_place, absolute_source
+from datagen.jobs.options import JobKeywords, JobOptions, absolute_path, absolute_source
 from datagen.schemas.errors import InputError
 from datagen.schemas.whole_files import whole_file
 
@@ -31,7 +39,7 @@ def make(
     *,
     houses: str,
     objects: str,
-    out: Place,
+    out: PathOrAddress,
     run: Names = None,
     benchmark: File | None = None,
     **job: Unpack[JobKeywords],
@@ -60,9 +68,9 @@ def make(
     job_options.refuse_bad()
     definition = read_benchmark(None if benchmark is None else Path(benchmark))
     runs = definition.chosen(run or ())
-    folder = Path(absolute_place(out))
-    said = {"--houses": absolute_source(houses), "--objects": absolute_source(objects), "--out": str(folder)}
-    words = ["benchmark", "make", *words_of(said)]
+    folder = Path(absolute_path(out))
+    given = {"--houses": absolute_source(houses), "--objects": absolute_source(objects), "--out": str(folder)}
+    words = ["benchmark", "make", *words_of(given)]
     for name in run or ():
         words += ["--run", name]
     words += words_of({"--benchmark": None if benchmark is None else str(Path(benchmark).absolute())})
@@ -107,9 +115,9 @@ def score(
     methods: Annotated[Sequence[str], Parameter(name="METHOD...")],
     /,
     *,
-    runs: Place,
+    runs: PathOrAddress,
     run: Names = None,
-    fit: Places | None = None,
+    fit: PathsOrAddresses | None = None,
     benchmark: File | None = None,
     bootstrap: Whole = 1000,
     seed: Whole = 0,
@@ -120,7 +128,7 @@ def score(
     """Score methods on the benchmark's runs, and print the leaderboard.
 
     A METHOD is `released`, a checkpoint, a CSV file of scores, the name of a baseline, or module:function,
-    whose code is run. A run that is not the benchmark's is refused with what differs.
+    whose code is run. A run that is not the benchmark's is refused with its differences.
 
     For example: datagen benchmark score released mine.csv scalars --runs runs --fit val --out board.html
 
@@ -156,17 +164,17 @@ def score(
         use_threads(threads)
     definition = read_benchmark(None if benchmark is None else Path(benchmark))
     wanted = definition.chosen(run or ())
-    places = {name: f"{str(runs).rstrip('/')}/{name}" for name in wanted}
-    for name, place in places.items():
-        refuse_differing(place, name, wanted[name], definition.version)
-    opened = [open_evaluated_runs([place])[0] for place in places.values()]
-    compared = open_methods(methods, [str(place) for place in fit or ()], seed, opened, json)
+    paths = {name: f"{str(runs).rstrip('/')}/{name}" for name in wanted}
+    for name, path in paths.items():
+        refuse_differing(path, name, wanted[name], definition.version)
+    opened = [open_evaluated_runs([path])[0] for path in paths.values()]
+    compared = open_methods(methods, [str(path) for path in fit or ()], seed, opened, json)
     refuse_seen_houses(opened, compared, "Train it on runs of the splits train and val alone")
-    for (name, place), each in zip(places.items(), opened, strict=True):
-        refuse_trained_objects(place, each, compared, wanted[name].objects == "test")
+    for (name, path), each in zip(paths.items(), opened, strict=True):
+        refuse_trained_objects(path, each, compared, wanted[name].objects == "test")
     gathered = score_runs(opened, compared, seed, json)
     report = leaderboard(
-        definition, wanted, gathered, compared, [str(place) for place in fit or ()], bootstrap, seed
+        definition, wanted, gathered, compared, [str(path) for path in fit or ()], bootstrap, seed
     )
     for file in files:
         with whole_file(file, alone=True) as stream:

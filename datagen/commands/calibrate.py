@@ -71,7 +71,7 @@ def calibrate(
         out: The .toml file to write; it must not exist.
         candidates: The candidates to fit on.
         distance: Distance that the score depends on; any: the best.
-        objective: What is maximised: balanced accuracy or accuracy.
+        objective: Metric to maximise: balanced accuracy or accuracy.
         fit_alpha: Also fit the weight of the visibility score.
         split_check: Fail, instead of warn, where a run is not of --split val.
         bootstrap: Resamples of scenes for each interval.
@@ -108,9 +108,9 @@ def calibrate(
         "warnings": warnings,
         **_findings(made),
     }
-    said = {"--candidates": candidates, "--distance": distance, "--objective": objective}
+    options = {"--candidates": candidates, "--distance": distance, "--objective": objective}
     flags = [*(["--fit-alpha"] if fit_alpha else []), *(["--split-check"] if split_check else [])]
-    words = [*runs, "--out", str(out), *(word for option in said.items() for word in option), *flags]
+    words = [*runs, "--out", str(out), *(word for option in options.items() for word in option), *flags]
     command = shlex.join(["datagen", "calibrate", *words, "--bootstrap", str(bootstrap), "--seed", str(seed)])
     _write_new(out, _toml(report, command, made.after))
     if json:
@@ -125,51 +125,51 @@ def calibrate(
 
 
 def _specifications(
-    places: Sequence[str], candidates: Sets, split_check: bool
+    paths: Sequence[str], candidates: Sets, split_check: bool
 ) -> tuple[list[Specification], list[str]]:
     """Specifications of all runs, and warnings. InputError where their labels cannot be fitted together."""
     found: list[tuple[str, Specification]] = [
-        (place, run.manifest.spec) for place in places for run in open_runs(place)
+        (path, run.manifest.spec) for path in paths for run in open_runs(path)
     ]
-    first_place, first = found[0]
+    first_path, first = found[0]
     scenes: set[str] = set()
     warnings: list[str] = []
-    for place, spec in found:
+    for path, spec in found:
         if spec.label_source == "heuristic":
             problem = "heuristic labels come from the rule itself and cannot calibrate it"
             fix = "Name a run with trials of its scenes: datagen submit sim --scenes-from RUN"
-            raise InputError(place, "label_source", problem, fix)
+            raise InputError(path, "label_source", problem, fix)
         if spec.label_source != first.label_source:
-            problem = f"is {spec.label_source}, but {first_place} has {first.label_source} labels"
-            raise InputError(place, "label_source", problem, "Name runs of one label source")
+            problem = f"is {spec.label_source}, but {first_path} has {first.label_source} labels"
+            raise InputError(path, "label_source", problem, "Name runs of one label source")
         if spec.heuristic != first.heuristic:
-            problem = f"differs from that of {first_place}"
-            raise InputError(place, "heuristic", problem, "Calibrate the two runs separately")
+            problem = f"differs from that of {first_path}"
+            raise InputError(path, "heuristic", problem, "Calibrate the two runs separately")
         if spec.scenes_hash in scenes:
             problem = "are also in another run of this command"
-            raise InputError(place, "scenes", problem, "Name each set of scenes once")
+            raise InputError(path, "scenes", problem, "Name each set of scenes once")
         scenes.add(spec.scenes_hash)
         held = spec.candidates.within or "grid"
         if CANDIDATE_SETS.index(candidates) > CANDIDATE_SETS.index(held):
             problem = f"the run has {held} candidates, not {candidates}"
-            raise InputError(place, "--candidates", problem, f"Give --candidates {held}")
+            raise InputError(path, "--candidates", problem, f"Give --candidates {held}")
         if spec.split != "val":
             problem = f"is {spec.split}, but parameters are chosen on val"
             if split_check:
                 fix = "Make a run with `datagen submit --split val`, or omit --split-check"
-                raise InputError(place, "split", problem, fix)
-            warnings.append(f"{place}: split {problem}: evaluate on other houses")
+                raise InputError(path, "split", problem, fix)
+            warnings.append(f"{path}: split {problem}: evaluate on other houses")
     return [spec for _, spec in found], warnings
 
 
-def _read(places: Sequence[str], candidates: Sets, allow_incomplete: bool) -> Trials:
+def _read(paths: Sequence[str], candidates: Sets, allow_incomplete: bool) -> Trials:
     """The labels of all runs over the chosen set of candidates."""
     import numpy as np
 
     from datagen.train.heuristic_fit import Trials
     from datagen.train.reader import SampleReader
 
-    reader = SampleReader(places, ("house_id",), _SAMPLE_FIELDS, allow_incomplete)
+    reader = SampleReader(paths, ("house_id",), _SAMPLE_FIELDS, allow_incomplete)
     parts: list[dict[str, Any]] = []
     n_scenes = 0
     for columns in reader.shards():
@@ -203,15 +203,19 @@ def _calibrate(
         return fit(some, before, forms, objective, fit_alpha)
 
     after = refit(trials)
-    if len(set(trials.said(after).tolist())) == 1:
+    if len(set(trials.labels_by(after).tolist())) == 1:
         problem = f"the best parameters give all {len(trials):,} candidates one label"
         fix = "Choose --objective balanced, another --distance, or other --candidates"
         raise InputError("datagen calibrate", "--objective", problem, fix)
     step()
     left_out = fit_leaving_houses_out(trials, refit, seed, step)
-    said = {"before": trials.said(before), "after": left_out.said, "fitted": trials.said(after)}
-    found = agreements(trials, list(said.values()), resamples, seed)
-    return _Calibrated(before, after, left_out.params, dict(zip(said, found, strict=True)))
+    predicted = {
+        "before": trials.labels_by(before),
+        "after": left_out.labels,
+        "fitted": trials.labels_by(after),
+    }
+    found = agreements(trials, list(predicted.values()), resamples, seed)
+    return _Calibrated(before, after, left_out.params, dict(zip(predicted, found, strict=True)))
 
 
 def _findings(made: _Calibrated) -> dict[str, Any]:
@@ -221,15 +225,15 @@ def _findings(made: _Calibrated) -> dict[str, Any]:
         counts = dict(zip(_COUNTS, map(int, agreement.confusion), strict=True))
         return {name: _estimate(getattr(agreement, name)) for name in _METRICS} | {"confusion": counts}
 
-    told = {name: record(agreement) for name, agreement in made.agreements.items()}
+    records = {name: record(agreement) for name, agreement in made.agreements.items()}
     gain: dict[str, Any] = {}
     for name in _METRICS:
         difference = getattr(made.agreements["after"], name).minus(getattr(made.agreements["before"], name))
         gain[name] = {**_estimate(difference), "verdict": verdict(difference)}
     return {
-        "before": {"heuristic": made.before.model_dump(), **told["before"]},
-        "after": {"heuristic": made.after.model_dump(), **told["after"]},
-        "on_the_fitted": told["fitted"],
+        "before": {"heuristic": made.before.model_dump(), **records["before"]},
+        "after": {"heuristic": made.after.model_dump(), **records["after"]},
+        "on_the_fitted": records["fitted"],
         "gain": gain,
         "folds": [params.model_dump() for params in made.by_fold],
     }

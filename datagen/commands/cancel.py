@@ -20,10 +20,10 @@ from datagen.schemas.jobs import Jobs, StoredJob
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.storage import open_storage
 
-_LOOK_S = 1.0
-# A driver polls for requests every few seconds; a detached one that takes longer does not answer.
+_POLL_S = 1.0
+# A driver polls for stop requests every few seconds; a detached one that is slower counts as unresponsive.
 _ANSWER_WITHIN_S = 30.0
-# Longer than a working driver is silent; one without worker processes polls between two shards.
+# Longer than a working driver is silent: without worker processes it polls only between two shards.
 _GIVE_UP_S = 180.0
 
 
@@ -54,34 +54,34 @@ def cancel(
         return _cancel_head(now)
     if run is None:
         raise InputError("datagen cancel", "RUN", "is missing", "Name a run, or give --head")
-    place = open_storage(run, probe=False, create=False)
-    open_runs(place)  # InputError where there is no run
-    jobs = Jobs(place)
-    asked = [job for job in jobs.all() if job.health() in ("live", "silent")]
-    for job in asked:
+    storage = open_storage(run, probe=False, create=False)
+    open_runs(storage)  # InputError where there is no run
+    jobs = Jobs(storage)
+    running = [job for job in jobs.all() if job.health() in ("live", "silent")]
+    for job in running:
         jobs.ask_to_stop(job.id, now)
-    ended = [_await_end(jobs, job) for job in asked]
-    living = [job for job in ended if job.health() not in ("ended", "dead")]
+    ended = [_await_end(jobs, job) for job in running]
+    unfinished = [job for job in ended if job.health() not in ("ended", "dead")]
     if json:
-        print_json({"run": place.url, "jobs": [job_report(job) for job in ended]})
+        print_json({"run": storage.url, "jobs": [job_report(job) for job in ended]})
     elif not ended:
         print_rows(f"cancel {run}", [("jobs", "none is running")])
     else:
         print_rows(f"cancel {run}", [(job.id, health_line(job)) for job in ended])
-        if not living:
+        if not unfinished:
             sys.stdout.write(f"{resume_with(['resume', run])}\n")
-    for job in living:
-        _say(
+    for job in unfinished:
+        _print_stderr(
             f"{run}: job {job.id} was asked to stop and has not ended; its last sign was "
             f"{seconds(job.silence().total_seconds())} ago. To end it by force: "
             f"kill -9 {job.record.pid} on {job.record.host}, then {command_line(['resume', run])}"
         )
-    return 1 if living else 0
+    return 1 if unfinished else 0
 
 
 def _await_end(jobs: Jobs, job: StoredJob) -> StoredJob:
     """Return the job once it has ended, is dead, or does not answer."""
-    since_s, told, stopped = time.monotonic(), "", False
+    since_s, printed, stopped = time.monotonic(), "", False
     while True:
         job = jobs.get(job.id) or job
         health, waited_s = job.health(), time.monotonic() - since_s
@@ -97,10 +97,10 @@ def _await_end(jobs: Jobs, job: StoredJob) -> StoredJob:
         if stopped and waited_s >= 2 * _ANSWER_WITHIN_S:
             return job
         line = health_line(job)
-        if line.partition(", heard")[0] != told.partition(", heard")[0]:
-            _say(f"{job.id}: {line}")
-            told = line
-        time.sleep(_LOOK_S)
+        if line.partition(", heard")[0] != printed.partition(", heard")[0]:
+            _print_stderr(f"{job.id}: {line}")
+            printed = line
+        time.sleep(_POLL_S)
 
 
 def _answers(job: StoredJob) -> bool:
@@ -108,11 +108,11 @@ def _answers(job: StoredJob) -> bool:
 
 
 def _stop_submission(job: StoredJob) -> None:
-    """Stop a detached job through Ray; without Ray the job is gone too."""
+    """Stop a detached job through Ray; where Ray has ended, so has the job."""
     try:
         jobs_api_of(job.record.jobs_api).stop(job.record.submission)
     except InputError as error:
-        _say(f"{job.id}: {error}")
+        _print_stderr(f"{job.id}: {error}")
 
 
 def _cancel_head(now: bool) -> int:
@@ -126,11 +126,11 @@ def _cancel_head(now: bool) -> int:
             )
     began_s = time.monotonic()
     ended = stop_head()
-    said = f"stopped after {seconds(time.monotonic() - began_s)}" if ended else "none runs for this user"
-    print_rows("Ray for detached jobs", [("head", said)])
+    outcome = f"stopped after {seconds(time.monotonic() - began_s)}" if ended else "none runs for this user"
+    print_rows("Ray for detached jobs", [("head", outcome)])
     return 0
 
 
-def _say(line: str) -> None:
+def _print_stderr(line: str) -> None:
     sys.stderr.write(line + "\n")
     sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""`datagen closed-loop`: send a robot to the picks of methods, let it arrive off them, and execute."""
+"""`datagen closed-loop`: send a robot to methods' picks with arrival errors, and execute."""
 
 from __future__ import annotations
 
@@ -11,8 +11,16 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from datagen.console.command_lines import say_interrupted
-from datagen.console.options import AS_FOUND, AsJson, AssetSources, File, Places, Whole, refuse_odd_draws
+from datagen.console.command_lines import print_interrupted
+from datagen.console.options import (
+    AS_FOUND,
+    AsJson,
+    AssetSources,
+    File,
+    PathsOrAddresses,
+    Whole,
+    refuse_odd_draws,
+)
 from datagen.console.printing import print_json
 from datagen.schemas.errors import InputError
 from datagen.schemas.progress import counting
@@ -31,7 +39,7 @@ def closed_loop(
     arrival: Sequence[str] | None = None,
     repeats: Whole = 3,
     scenes: Whole | None = None,
-    fit: Places | None = None,
+    fit: PathsOrAddresses | None = None,
     baselines: Sequence[str] | None = None,
     detector: File | None = None,
     heuristic: File | None = None,
@@ -41,12 +49,12 @@ def closed_loop(
     given: AssetSources = AS_FOUND,
     json: AsJson = False,
 ) -> int:
-    """Send a robot to each method's pick, let it arrive off it, plan from there, and execute.
+    """Send a robot to each method's pick with an arrival error, plan from there, and execute.
 
     Over whole grids of runs, each method picks the clear cell with its best score, and the one with the best
     mean score over the arrival error. A base that arrives where it does not fit fails. The robot knows where
-    it arrived and plans from there; with --mode sim the plan is executed where target, friction and mass are
-    not as planned. Equal arrivals are made once. After Ctrl-C, or with more methods, the same command makes
+    it arrived and plans from there; with --mode sim the plan is executed with errors of target, friction and
+    mass. Equal arrivals are made once. After Ctrl-C, or with more methods, the same command makes
     only what is missing.
 
     For example: datagen closed-loop model.ckpt runs/grids --fit runs/val --out loop
@@ -96,8 +104,8 @@ def closed_loop(
     refuse_missing_packages(mode)
     fit_on = [str(path) for path in fit or ()]
     errors = arrivals_of([read_arrival(text) for text in arrival or ()])
-    checkpoints, places = split_paths(paths)
-    runs, models = open_evaluated_runs(places), open_models(checkpoints)
+    checkpoints, run_paths = split_paths(paths)
+    runs, models = open_evaluated_runs(run_paths), open_models(checkpoints)
     refuse_seen_houses(runs, models)
     rule = None if heuristic is None else read_heuristic(Path(heuristic), runs, False)
     folder = None if detector is None else Path(detector)
@@ -117,7 +125,7 @@ def closed_loop(
         of = sum(n for _, n in missing)
         todo = [task for task, n in missing if n]
         if not work_through(_VERB, make_arrivals, todo, processes, stopping, lambda done: seen(done, of)):
-            say_interrupted("; finished arrivals are kept", sys.argv[1:])
+            print_interrupted("; finished arrivals are kept", sys.argv[1:])
             return 130
     record = loop_record(loop, plain, models, runs, fit_on, bootstrap, seed)
     with whole_file(out / "closed-loop.json") as file:

@@ -14,7 +14,7 @@ from datagen.schemas.errors import InputError
 
 
 def print_estimates(report: dict[str, Any], json: bool, **_: Any) -> int:
-    """Print the rates, with what further labels would cost."""
+    """Print the rates, and the cost of further labels."""
     if json:
         print_json(report)
         return 0

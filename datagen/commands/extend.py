@@ -8,18 +8,18 @@ from typing import Unpack
 
 from datagen.configuration.stored_scenes import StoredScenes, refuse_too_few
 from datagen.console.command_lines import prints
-from datagen.console.options import AS_FOUND, RunPlace, Sources, Whole
+from datagen.console.options import AS_FOUND, RunPath, Sources, Whole
 from datagen.jobs.dry_run import PlannedRun
 from datagen.jobs.job import JobRun
 from datagen.jobs.job_report import JobResult, print_job
-from datagen.jobs.options import JobKeywords, JobOptions, absolute_place, refuse_odd_n
+from datagen.jobs.options import JobKeywords, JobOptions, absolute_path, refuse_odd_n
 from datagen.jobs.start_job import continue_job, planned_run, source_words
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 
 
 @prints(print_job)
-def extend(run: RunPlace, /, *, n: Whole, given: Sources = AS_FOUND, **job: Unpack[JobKeywords]) -> JobResult:
+def extend(run: RunPath, /, *, n: Whole, given: Sources = AS_FOUND, **job: Unpack[JobKeywords]) -> JobResult:
     """Raise the number of labels of a run to n and make the missing ones; existing shards keep their bytes.
 
     In merged runs, the new labels are divided evenly among the parts, in whole shards.
@@ -32,7 +32,7 @@ def extend(run: RunPlace, /, *, n: Whole, given: Sources = AS_FOUND, **job: Unpa
     job_options = JobOptions(**job)
     job_options.refuse_bad()
     refuse_odd_n(n)
-    words = ["extend", absolute_place(run), "--n", str(n), *source_words(given), *job_options.words()]
+    words = ["extend", absolute_path(run), "--n", str(n), *source_words(given), *job_options.words()]
 
     def wanted_of(job_runs: Sequence[JobRun]) -> list[int]:
         wanted = longer([job_run.run for job_run in job_runs], n, run)
@@ -57,11 +57,11 @@ def extend(run: RunPlace, /, *, n: Whole, given: Sources = AS_FOUND, **job: Unpa
     return continue_job(words, run, given, job_options, grow, planned)
 
 
-def longer(runs: Sequence[Run], n: int, place: str) -> list[int]:
-    """Return the labels of each run for n in total. InputError where n is less than there are now."""
+def longer(runs: Sequence[Run], n: int, path: str) -> list[int]:
+    """Return the number of labels of each run for n in total. InputError where n is smaller than now."""
     have = [run.n for run in runs]
     if n < sum(have):
-        problem = f"{place} already has {sum(have):,} planned, and a run never shrinks"
+        problem = f"{path} already has {sum(have):,} planned, and a run never shrinks"
         raise InputError("--n", str(n), problem, f"Give {sum(have)} or more")
     return shares(have, [run.layout.samples_per_shard for run in runs], n)
 
@@ -78,11 +78,11 @@ def shares(have: Sequence[int], per_shard: Sequence[int], n: int) -> list[int]:
     step = missing // len(have) - max(per_shard)
     given = [max(0, step // size) * size for size in per_shard]
     missing -= sum(given)
-    line = [(labels, k) for k, labels in enumerate(given)]
-    heapify(line)
-    while missing >= per_shard[line[0][1]]:
-        labels, k = line[0]
+    heap = [(labels, k) for k, labels in enumerate(given)]
+    heapify(heap)
+    while missing >= per_shard[heap[0][1]]:
+        labels, k = heap[0]
         missing, given[k] = missing - per_shard[k], labels + per_shard[k]
-        heapreplace(line, (given[k], k))
+        heapreplace(heap, (given[k], k))
     given[-1] += missing
     return [a + b for a, b in zip(have, given, strict=True)]

@@ -1,4 +1,4 @@
-"""`datagen frontier`: accuracy against the cost of labels, and what to buy next."""
+"""`datagen frontier`: compare accuracy with the cost of labels, and choose labels to buy next."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.console.command_lines import say_interrupted
+from datagen.console.command_lines import print_interrupted
 from datagen.console.options import AllowIncomplete, AsJson, Whole, refuse_odd_draws
 from datagen.console.printing import print_json
 from datagen.schemas.errors import InputError
@@ -47,7 +47,7 @@ def frontier(
     allow_incomplete: AllowIncomplete = False,
     json: AsJson = False,
 ) -> int:
-    """Show which labels pay: accuracy of models against the cost of their labels, and what to buy next.
+    """Compare the accuracy of models with the cost of their labels, and choose labels to buy next.
 
     Small models are trained on every label source alone and on dearer labels after cheaper ones, each on
     nested shares of the houses, and are tested within reach. Learning curves of the sources are fitted and
@@ -62,7 +62,7 @@ def frontier(
         out: Folder for encodings, trainings, frontier.json and frontier.svg.
         prices: Prices as a TOML file [datagen's own].
         target_accuracy: Balanced accuracy within reach to buy labels for, such as 0.85.
-        budget: What to spend on labels next: CPU time (5cpu-h) or money (3usd).
+        budget: Budget for the next labels: CPU time (5cpu-h) or money (3usd).
         shares: Shares of each run's houses to train on, ascending; the last is 1.
         seeds: Trainings of each mixture; each seed has its own order of houses.
         bootstrap: Resamples of seeds and scenes.
@@ -81,14 +81,14 @@ def frontier(
 
     priced, cpu_h = read_prices(prices), budget_cpu_h(budget, prices)
     by_source = _by_source(runs)
-    for option, places in (("--val", val), ("--test", test)):
-        _refuse_not_dear(places, option)
+    for option, paths in (("--val", val), ("--test", test)):
+        _refuse_not_dear(paths, option)
     sources = [name for name in FIDELITY if name in by_source]
     costs = label_costs({name: by_source[name] for name in sources}, priced)
     try:
         encoded = _encoded({**by_source, "val": list(val), "test": list(test)}, out, allow_incomplete, json)
     except KeyboardInterrupt:
-        say_interrupted("; finished encodings are kept", sys.argv[1:])
+        print_interrupted("; finished encodings are kept", sys.argv[1:])
         return 130
     folders = {name: str(out / "encodings" / data.key) for name, data in encoded.items()}
     mixtures = mixtures_of(sources, sorted(shares))
@@ -96,7 +96,7 @@ def frontier(
     processes = workers or len(os.sched_getaffinity(0))
     with interruptible() as stopping, counting("trainings", json) as seen:
         if not make_trainings(tasks, processes, stopping, seen):
-            say_interrupted("; finished trainings are kept", sys.argv[1:])
+            print_interrupted("; finished trainings are kept", sys.argv[1:])
             return 130
     record = _report(tasks, encoded["test"], costs, priced, cpu_h, target_accuracy, bootstrap, seed, out)
     record |= {"runs": by_source, "val": list(val), "test": list(test)}
@@ -122,7 +122,7 @@ def _report(
     seed: int,
     out: Path,
 ) -> dict[str, Any]:
-    """Fit, draw, and return the document."""
+    """Fit the learning curves, draw the figure, and return the JSON document."""
     import numpy as np
 
     from datagen.frontier.figure import draw_frontier
@@ -150,19 +150,19 @@ def _report(
 
 
 def _encoded(
-    places: dict[str, list[str]], out: Path, allow_incomplete: bool, json: bool
+    paths: dict[str, list[str]], out: Path, allow_incomplete: bool, json: bool
 ) -> dict[str, EncodedRuns]:
-    """The encoded runs of each source, of "val" and of "test". InputError where sides share a house."""
+    """Encode the runs of each source, "val" and "test". InputError where val or test shares a house."""
     from datagen.frontier.mixtures import MODEL_CONFIG
     from datagen.train.encoded.runs import encode_runs, encoded_stream
     from datagen.train.models.shared import SharedModel
     from datagen.train.scorers import use_threads
     from datagen.train.splits import refuse_one_class, refuse_shared_houses
 
-    use_threads(1)  # a robot's cloud is so little work that threads would only wait for each other
+    use_threads(1)  # one robot's point cloud is too little work for several threads
     streams: dict[str, SampleStream] = {}
-    for name, of_name in places.items():
-        streams[name] = encoded_stream(of_name, allow_incomplete)
+    for name, of_source in paths.items():
+        streams[name] = encoded_stream(of_source, allow_incomplete)
         refuse_one_class(streams[name])
     for name, stream in streams.items():
         for judge in ("val", "test"):
@@ -176,26 +176,28 @@ def _encoded(
 
 
 def _by_source(runs: Sequence[str]) -> dict[str, list[str]]:
-    """The places of each label source. InputError for merged runs of several, and without a dear source."""
+    """The runs' paths by label source. InputError for merged runs of several, and without a dear source."""
     found: dict[str, list[str]] = {}
-    for place in runs:
-        sources = sorted({run.manifest.spec.label_source for run in open_runs(place)})
+    for path in runs:
+        sources = sorted({run.manifest.spec.label_source for run in open_runs(path)})
         if len(sources) > 1:
             problem = f"has labels of {' and '.join(sources)}"
-            raise InputError(place, "label_source", problem, "Name the runs that were merged")
-        found.setdefault(sources[0], []).append(place)
+            raise InputError(path, "label_source", problem, "Name the runs that were merged")
+        found.setdefault(sources[0], []).append(path)
     if not any(source in found for source in _DEAR):
         problem = "all have heuristic labels"
         raise InputError("datagen frontier", "RUN", problem, "Name a run of `datagen submit plan` or sim too")
     return found
 
 
-def _refuse_not_dear(places: Sequence[str], option: str) -> None:
-    for place in places:
-        for run in open_runs(place):
+def _refuse_not_dear(paths: Sequence[str], option: str) -> None:
+    for path in paths:
+        for run in open_runs(path):
             if (source := run.manifest.spec.label_source) not in _DEAR:
                 fix = f"Name a run of `datagen submit plan` or sim with {option}"
-                raise InputError(place, "label_source", f"is {source}, which no model is judged by", fix)
+                raise InputError(
+                    path, "label_source", f"is {source}: models are judged on plan or sim labels", fix
+                )
 
 
 def _refuse_odd_options(

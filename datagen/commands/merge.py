@@ -9,9 +9,9 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from datagen.console.command_lines import command_line, prints, resumable, words_of
-from datagen.console.options import AsJson, Place
+from datagen.console.options import AsJson, PathOrAddress
 from datagen.console.printing import print_json, print_rows, seconds
-from datagen.jobs.options import absolute_place
+from datagen.jobs.options import absolute_path
 from datagen.reports.spending import account_for
 from datagen.schemas.lineage import lineage_summary
 from datagen.schemas.merged_runs import label_counts, open_runs
@@ -49,12 +49,12 @@ def print_merged(report: dict[str, Any], json: bool, **_: Any) -> int:
     print_rows(f"merged: {out}", rows)
     for part in report["runs"]:
         shards = part["shards"]
-        told = [f"{shards[k]} {word}" for k, word in _WORDS.items() if shards[k]]
+        counts = [f"{shards[k]} {word}" for k, word in _WORDS.items() if shards[k]]
         print_rows(
             f"run {part['spec_hash'][:16]}, seed {part['seed']}, {part['split']} of {part['houses']} houses",
             [
                 ("labels", f"{part['labels']:,} of {part['n']:,}"),
-                ("shards", ", ".join(told) or "none"),
+                ("shards", ", ".join(counts) or "none"),
                 *(("from", _origin(origin)) for origin in part["lineage"]),
             ],
         )
@@ -69,7 +69,11 @@ def _origin(origin: dict[str, Any]) -> str:
 
 @prints(print_merged)
 def merge(
-    runs: Annotated[Sequence[str | Path], Parameter(name="RUN...")], /, *, out: Place, json: AsJson = False
+    runs: Annotated[Sequence[str | Path], Parameter(name="RUN...")],
+    /,
+    *,
+    out: PathOrAddress,
+    json: AsJson = False,
 ) -> dict[str, Any]:
     """Merge runs into one: from several machines, seeds or houses; partial, overlapping or merged ones too.
 
@@ -96,9 +100,9 @@ def merge(
         (32, 2)
     """
     runs, out = [str(run) for run in runs], str(out)
-    words = ["merge", *map(absolute_place, runs), *words_of({"--out": absolute_place(out), "--json": json})]
+    words = ["merge", *map(absolute_path, runs), *words_of({"--out": absolute_path(out), "--json": json})]
     with resumable(words):
-        commits = sum(len(run.committed()) for place in runs for run in open_runs(place))
+        commits = sum(len(run.committed()) for path in runs for run in open_runs(path))
         with steps("commits read", commits, json) as step:
             planned = plan_merge(runs, out, step)
         with steps("records written", planned.records, json) as step:
@@ -108,11 +112,11 @@ def merge(
 
 def merge_report(planned: MergePlan, result: MergeResult) -> dict[str, Any]:
     """Return what was merged as plain values; times in seconds."""
-    parts = open_runs(result.place)
+    parts = open_runs(result.storage)
     done = {w.run.storage.url: w for w in result.written}
     spending = account_for(parts)
     return {
-        "out": result.place.url,
+        "out": result.storage.url,
         "labels": label_counts(parts).labels,
         "n": label_counts(parts).n,
         "sealed": result.sealed,
@@ -123,16 +127,16 @@ def merge_report(planned: MergePlan, result: MergeResult) -> dict[str, Any]:
 
 
 def _part(run: Run, written: WrittenUnion | None) -> dict[str, Any]:
-    spec, want = run.manifest.spec, label_counts([run])
+    spec, counts = run.manifest.spec, label_counts([run])
     return {
         "run": run.storage.url,
         "spec_hash": run.manifest.spec_hash,
         "seed": spec.seed,
         "split": spec.split,
         "houses": spec.houses.kind,
-        "n": want.n,
-        "labels": want.labels,
-        "missing_shards": want.missing,
+        "n": counts.n,
+        "labels": counts.labels,
+        "missing_shards": counts.missing,
         "shards": {
             "there_before": written.there if written else len(run.committed()),
             "linked": written.linked if written else 0,

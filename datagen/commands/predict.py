@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     Checkpoint = str | Path | Scorer
     Outline = str | float | Sequence[Sequence[float]] | Footprint
 else:
-    # What the command line resolves, without importing torch.
+    # Types that the command line resolves without importing torch.
     Prediction, Frames, Checkpoint, Outline = Any, Sequence[Path], str | Path, str
 
 _LARGEST_M = 10.0
 _MOST_FRAMES = 64
 _MOST_ENTRIES = 10_000
-# Written by --demo in the working folder, unless it is told where.
+# Written by --demo in the working folder, unless --out or --html is given.
 DEMO_PICTURE, DEMO_PAGE = Path("demo.png"), Path("demo.html")
 
 
@@ -51,7 +51,7 @@ def print_prediction(
     **_: Any,
 ) -> int:
     """Print the best base pose; the exit code is 1 when no cell was seen to be clear."""
-    from datagen.train.prediction.prediction_report import document, told
+    from datagen.train.prediction.prediction_report import document, report_rows
 
     if json:
         print_json(document(prediction))
@@ -59,7 +59,7 @@ def print_prediction(
         if demo:
             out, html = out or DEMO_PICTURE, html or DEMO_PAGE
         written = [(name, str(file)) for name, file in (("picture", out), ("page", html)) if file is not None]
-        print_rows(f"base poses by {prediction.scorer}", [*told(prediction), *written])
+        print_rows(f"base poses by {prediction.scorer}", [*report_rows(prediction), *written])
     return 0 if prediction.best is not None else 1
 
 
@@ -123,10 +123,10 @@ def predict(
     For example: datagen predict --base-height 0.4 --reach 0.85 --frame FRAME.npz --out best.png
 
     Args:
-        checkpoint: Checkpoint of `datagen train`; in Python also what `datagen.load_scorer` made of it
+        checkpoint: Checkpoint of `datagen train`; in Python also a scorer of `datagen.load_scorer`
             [the released model].
-        base_height: Height of the arm's mount above the floor (m); only --demo has its own.
-        reach: Reach of the arm from its mount (m); only --demo has its own.
+        base_height: Height of the arm's mount above the floor (m); only --demo has a default.
+        reach: Reach of the arm from its mount (m); only --demo has a default.
         demo: Predict on the frame that ships with the package; writes demo.png and demo.html.
         rgb: Colour image, aligned with the depth image.
         depth: Depth image, 16-bit PNG.
@@ -148,13 +148,13 @@ def predict(
         arrival_std: The same as --arrival normal:, in metres, with yaw after a comma: 0.05,3deg.
         out: Picture to write, FILE.png.
         html: Page to write, FILE.html.
-        json: Of the command line alone.
+        json: For the command line only.
 
     Returns:
         All poses. `best` is the row of the best clear one (None where none was seen to be clear),
         `T_world_base(row)` and `T_camera_base(row)` are 4x4 poses of the arm's mount (x towards the target),
-        `base_xy_m` (N, 2) and `yaw_rad` (N,) those of all rows, `score` (N,) says how good they are, and
-        `sure` how far to trust the answer. World is the frame of `T_world_camera` where frames have it, as a
+        `base_xy_m` (N, 2) and `yaw_rad` (N,) those of all rows, `score` (N,) their scores, and `sure` the
+        confidence in the answer. World is the frame of `T_world_camera` where frames have it, as a
         robot's map; else its origin is on the floor below the camera. A frame in Python may also be a
         SensorFrame.
 
@@ -190,7 +190,7 @@ def predict(
         raise InputError("--depth-scale", str(depth_scale), "is not between 0.000001 and 1", fix)
     outline = None if footprint is None else read_footprint(footprint)
     error = arrival_of(arrival, arrival_std)
-    falls = None if gravity is None else _direction(gravity)
+    direction = None if gravity is None else _direction(gravity)
     rgb, depth, intrinsics, mask, camera_pose, frame_dir, out, html = (
         None if path is None else Path(path)
         for path in (rgb, depth, intrinsics, mask, camera_pose, frame_dir, out, html)
@@ -212,7 +212,7 @@ def predict(
         frames,
         RobotSize(own_height, base_height, reach, outline),
         camera_height_m=camera_height,
-        gravity=falls,
+        gravity=direction,
         click=click,
         allow_unseen=allow_unseen,
         arrival=error,
@@ -238,7 +238,7 @@ def _frames(
     intrinsics: Path | None,
     mask: Path | None,
     camera_pose: Path | None,
-    places: Sequence[Path | SensorFrame],
+    frames_given: Sequence[Path | SensorFrame],
     folder: Path | None,
     depth_scale_m: float,
 ) -> list[SensorFrame]:
@@ -246,7 +246,7 @@ def _frames(
     from datagen.train.prediction.files import read_pose
     from datagen.train.prediction.frames import read_frame, read_place
 
-    named = list(places)
+    named = list(frames_given)
     if folder is not None:
         if not folder.is_dir():
             raise InputError(folder, "--frame-dir", "does not exist", "Name a folder of frames")
@@ -282,7 +282,7 @@ def _frames(
 
 
 def _refuse_with_demo(*given: object) -> None:
-    """Raise InputError for an option of a frame: the demonstration has its own."""
+    """Raise InputError for an option of a frame with --demo, which has its own."""
     if any(each is not None for each in given):
         fix = "Omit --demo to predict on a frame of your own"
         raise InputError("--demo", "", "has a frame and a click of its own", fix)

@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 from typing import Literal
 
-from datagen.console.command_lines import command_line, say_interrupted
-from datagen.console.options import AsJson, RunPlace
+from datagen.console.command_lines import command_line, print_interrupted
+from datagen.console.options import AsJson, RunPath
 from datagen.console.printing import counted, print_json, print_rows, seconds
 from datagen.relabelling import Relabelled, relabel_all, relabelled_specification
 from datagen.schemas.errors import InputError
@@ -18,7 +18,7 @@ from datagen.schemas.storage import Storage, open_storage
 
 
 def relabel(
-    run: RunPlace,
+    run: RunPath,
     /,
     *,
     out: str,
@@ -66,16 +66,16 @@ def relabel(
     if all(spec.heuristic == s.manifest.spec.heuristic for spec, s in zip(specs, sources, strict=True)):
         problem = "has these parameters already"
         raise InputError(run, "heuristic", problem, "Give another parameter, such as --tau, or --config")
-    place = open_storage(out)
+    storage = open_storage(out)
     started_s = time.monotonic()
-    done = relabel_all(place, sources, specs, json)
-    return _report(run, out, place, done, time.monotonic() - started_s, json)
+    done = relabel_all(storage, sources, specs, json)
+    return _report(run, out, storage, done, time.monotonic() - started_s, json)
 
 
-def _report(run: str, out: str, place: Storage, done: Relabelled, elapsed_s: float, json: bool) -> int:
+def _report(run: str, out: str, storage: Storage, done: Relabelled, elapsed_s: float, json: bool) -> int:
     summary, labels, positives = done.summary, done.summary.totals.labels, done.summary.totals.positives
     report = {
-        "run": place.url,
+        "run": storage.url,
         "source": run,
         "end": summary.end,
         "spec_hashes": [r.manifest.spec_hash for r in done.runs],
@@ -98,7 +98,7 @@ def _report(run: str, out: str, place: Storage, done: Relabelled, elapsed_s: flo
         ]
         if done.absent:
             absent = counted(done.absent, "shard")
-            rows.append(("to come", f"{absent} that {run} has not: then relabel again"))
+            rows.append(("to come", f"{absent} that {run} lacks: make them, then relabel again"))
         print_rows(f"{summary.end}: {out}", rows)
     if summary.end == "aborted":
         raise InputError(
@@ -107,5 +107,5 @@ def _report(run: str, out: str, place: Storage, done: Relabelled, elapsed_s: flo
     if summary.end == "failed":
         sys.stderr.write(f"error: {out}: too many shards failed. See: datagen status {shlex.quote(out)}\n")
     if summary.end == "interrupted":
-        say_interrupted(f"; {counted(summary.remaining, 'shard')} left", sys.argv[1:])
+        print_interrupted(f"; {counted(summary.remaining, 'shard')} left", sys.argv[1:])
     return summary.exit_code

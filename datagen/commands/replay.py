@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from datagen.configuration.arms import refuse_missing_packages
-from datagen.console.options import AS_FOUND, AsJson, RunPlace, Sources, Whole, refuse_output
+from datagen.console.options import AS_FOUND, AsJson, RunPath, Sources, Whole, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.drawing.replay_picture import draw_replay
 from datagen.drawing.scene_picture import Shown
@@ -37,7 +37,7 @@ _SHOWN = 5
 
 
 def replay(
-    run: RunPlace,
+    run: RunPath,
     sample: Annotated[str | None, Parameter(name="SAMPLE_ID")] = None,
     /,
     *,
@@ -65,7 +65,7 @@ def replay(
         out: Picture to write, FILE.png: the stored and the replayed scene.
     """
     if sum(given is not None for given in (sample, scene, shard)) != 1:
-        problem = "is one of three ways to say what to replay"
+        problem = "is one of three ways to choose what to replay"
         raise InputError("datagen replay", "SAMPLE_ID", problem, "Give a sample id, --scene or --shard")
     if out is not None:
         refuse_output(out, "--out", ".png")
@@ -92,7 +92,7 @@ def find_sample(runs: list[Run], text: str, step: Step = lambda: None) -> tuple[
     Ids are hashes of specification, scene and candidate: they are computed, and only the list of commits is
     read. `step` is called for every shard. InputError where no id or more than one matches.
     """
-    place = runs[0].storage.url if len(runs) == 1 else f"{len(runs)} merged runs"
+    searched = runs[0].storage.url if len(runs) == 1 else f"{len(runs)} merged runs"
     wanted = text.lower()
     if not re.fullmatch(f"[0-9a-f]{{{_PREFIX_AT_LEAST},32}}", wanted):
         problem = f"is not {_PREFIX_AT_LEAST} to 32 hexadecimal digits"
@@ -116,11 +116,11 @@ def find_sample(runs: list[Run], text: str, step: Step = lambda: None) -> tuple[
                 break
     if not found:
         fix = "Give the id of a committed sample of this run"
-        raise InputError("SAMPLE_ID", text, f"is not a sample of {place}", fix)
+        raise InputError("SAMPLE_ID", text, f"is not a sample of {searched}", fix)
     if len(found) > 1:
         shown = ", ".join(_ids(r, s, k + 1)[k].hex() for r, s, k in found[:_SHOWN])
         raise InputError(
-            "SAMPLE_ID", text, f"matches several samples of {place} ({shown})", "Give more digits"
+            "SAMPLE_ID", text, f"matches several samples of {searched} ({shown})", "Give more digits"
         )
     return found[0]
 
@@ -131,16 +131,16 @@ def _ids(run: Run, scene: int, count: int) -> list[bytes]:
     return [row.tobytes() for row in ids]
 
 
-def _only(place: str, runs: list[Run], option: str) -> Run:
+def _only(path: str, runs: list[Run], option: str) -> Run:
     if len(runs) == 1:
         return runs[0]
     parts = ", ".join(run.storage.url for run in runs[:3])
     problem = f"each of the {len(runs)} merged runs has its own"
-    raise InputError(place, option, problem, f"Give a sample id, or name a part: {parts}")
+    raise InputError(path, option, problem, f"Give a sample id, or name a part: {parts}")
 
 
 def _compare(
-    place: str,
+    path: str,
     run: Run,
     scene: int,
     stored: SceneRows,
@@ -152,10 +152,12 @@ def _compare(
     replayer = open_replayer(run, origin)
     shard = scene // run.layout.scenes_per_shard
     candidates = stored.samples["candidate_index"].tolist()
-    drawn = (
-        None if replayer.drawing is None else replayer.redraw(int(stored.record["scene_index"]), candidates)
+    sampled = (
+        None
+        if replayer.sampling_world is None
+        else replayer.sample_again(int(stored.record["scene_index"]), candidates)
     )
-    stages = [] if drawn is None else compare_stages(run.schema, stored, drawn)
+    stages = [] if sampled is None else compare_stages(run.schema, stored, sampled)
     rows = range(len(stored.samples["label"])) if row is None else [row]
     kept = chosen_rows(stored, rows)
     recomputed = compare_stages(run.schema, kept, replayer.recompute(stored, rows), RECOMPUTED)
@@ -166,7 +168,7 @@ def _compare(
         "shard": shard,
         "sample": None if row is None else _sample_of(stored, row),
         "equal": equal,
-        "drawn_again": drawn is not None,
+        "drawn_again": sampled is not None,
         "stages": [_plain(stage) for stage in stages],
         "recomputed": [_plain(stage) for stage in recomputed],
         "differs_here": what_differs_here(run, shard),
@@ -174,14 +176,14 @@ def _compare(
     }
     if out is not None:
         before, again = (
-            Shown(place, run.manifest.spec, rows, reconstruct_scene(replayer.world, rows.record))
-            for rows in (stored, drawn or stored)
+            Shown(path, run.manifest.spec, rows, reconstruct_scene(replayer.world, rows.record))
+            for rows in (stored, sampled or stored)
         )
         draw_replay(report, before, again, row, out)
     if json:
         print_json(report)
     else:
-        _print(place, report)
+        _print(path, report)
     return 0 if equal else 1
 
 
@@ -214,7 +216,7 @@ def _words(stage: dict[str, Any]) -> str:
     )
 
 
-def _print(place: str, report: dict[str, Any]) -> None:
+def _print(path: str, report: dict[str, Any]) -> None:
     sample = report["sample"]
     rows = [(s["stage"], f"{s['fields']} fields", _words(s)) for s in report["stages"]]
     if not report["drawn_again"]:
@@ -222,7 +224,7 @@ def _print(place: str, report: dict[str, Any]) -> None:
     rows += [
         (f"{s['stage']}, from stored poses", f"{s['fields']} fields", _words(s)) for s in report["recomputed"]
     ]
-    name = f"scene {report['scene']} of {place}"
+    name = f"scene {report['scene']} of {path}"
     if sample is not None:
         x, y = sample["base_xy_m"]
         name = f"sample {sample['id']}, candidate {sample['candidate']} of {name}, base ({x:.3f}, {y:.3f}) m"

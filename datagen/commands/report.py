@@ -30,8 +30,8 @@ def report(
     """Write one HTML page about runs, checkpoints and evaluations. It opens offline.
 
     It shows what was made and from what, cost and waste, label balance, agreement of runs over the same
-    candidates, failures and quarantine, shards and scenes that stand out, and scenes in 3D. Of a large run,
-    256 random shards or 400,000 labels are read; the page says where. Pictures need the houses and objects.
+    candidates, failures and quarantine, shards and scenes that stand out, and scenes in 3D. Large runs are
+    sampled: 256 random shards or 400,000 labels; the page notes where. Pictures need the houses and objects.
 
     For example: datagen report runs/first model.ckpt evaluation.json --out report.html
 
@@ -39,7 +39,7 @@ def report(
         paths: Runs, sealed stores, checkpoints, and documents of datagen evaluate --json.
         out: Page to write: FILE.html.
         scenes: Scenes to show of each run, the most unusual first.
-        seed: Seed of the shards that are read of a large run.
+        seed: Seed of the sample of a large run.
     """
     if not paths:
         raise InputError("datagen report", "PATH", "is missing", "Name one or more runs")
@@ -60,7 +60,7 @@ def report(
     with whole_file(out, alone=True) as file:
         file.write(page)
     named = {"run": opened.runs, "checkpoint": opened.checkpoints, "evaluation": opened.evaluations}
-    about = ", ".join(counted(len(found), what) for what, found in named.items() if found)
+    about = ", ".join(counted(len(found), kind) for kind, found in named.items() if found)
     print_rows("report", [("about", about), ("page", f"{out} ({size(len(page))})")])
     return 0
 
@@ -74,13 +74,13 @@ def _costs(runs: Sequence[Run]) -> dict[str, Mapping[str, Any]]:
 
 
 def _agreement(runs: Sequence[Run]) -> list[Mapping[str, Any]]:
-    """The agreement of every two runs over the same candidates, of all and of those within reach."""
+    """The agreement of every two runs over the same candidates: over all, and over those within reach."""
     from datagen.reports.agreement import read_labelled
     from datagen.reports.label_costs import costs_of_runs
     from datagen.reports.paired_runs import AuditedRun, fidelity, pairs
     from datagen.reports.spending import account_for
 
-    # Labels are read of runs that share their candidates with another.
+    # Labels are read only from runs that share their candidates with another.
     shared = Counter(run.manifest.spec.scenes_hash for run in runs)
     ordered = sorted(
         (run for run in runs if shared[run.manifest.spec.scenes_hash] > 1),
@@ -92,5 +92,5 @@ def _agreement(runs: Sequence[Run]) -> list[Mapping[str, Any]]:
         for run, cost, spending in zip(ordered, costs_of_runs(ordered, spendings), spendings, strict=True)
     ]
     everywhere, near = pairs(audited, "grid"), pairs(audited, "in-range")
-    # Of runs whose candidates all lie within reach, the two are the same.
+    # Where all candidates lie within reach, the two are the same.
     return [*everywhere, *(b for a, b in zip(everywhere, near, strict=True) if a["count"] != b["count"])]

@@ -13,7 +13,7 @@ from datagen.console.printing import counted
 from datagen.jobs.dry_run import PlannedRun
 from datagen.jobs.job import JobRun
 from datagen.jobs.job_report import JobResult, print_job
-from datagen.jobs.options import JobKeywords, JobOptions, absolute_place
+from datagen.jobs.options import JobKeywords, JobOptions, absolute_path
 from datagen.jobs.start_job import continue_job, planned_run, source_words
 from datagen.schemas.quarantine import lift_quarantine
 
@@ -37,11 +37,11 @@ def resume(
         run: Folder or s3:// address of a run or of merged runs.
         quarantined: Try quarantined shards again; their records are kept.
         given: New locations of houses, objects and the run with the scenes, where they have moved.
-        job: As of `submit`: `workers`, `address`, `max_quarantined`, `detach`, `dry_run`, `budget`,
+        job: As for `submit`: `workers`, `address`, `max_quarantined`, `detach`, `dry_run`, `budget`,
             `prices`, `json` and `quiet`.
 
     Returns:
-        What was done.
+        The result of the job.
 
     Raises:
         InputError: The run or a source cannot be used.
@@ -54,7 +54,7 @@ def resume(
     """
     run, job_options = str(run), JobOptions(**job)
     job_options.refuse_bad()
-    words = ["resume", absolute_place(run), *words_of({"--quarantined": quarantined}), *source_words(given)]
+    words = ["resume", absolute_path(run), *words_of({"--quarantined": quarantined}), *source_words(given)]
     words += job_options.words()
 
     def lift(job_runs: Sequence[JobRun]) -> None:

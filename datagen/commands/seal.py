@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datagen.console.options import RunPlace
+from datagen.console.options import RunPath
 from datagen.console.printing import counted, listed, print_rows
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.sealing import SEALED, SealedRoot, sealed_root
@@ -11,7 +11,7 @@ from datagen.schemas.sealing import unseal as unseal_place
 from datagen.schemas.storage import open_storage
 
 
-def seal(run: RunPlace, /) -> int:
+def seal(run: RunPath, /) -> int:
     """Make one flat Zarr store, data.zarr, of the committed shards; the run may be unfinished.
 
     Chunks are hard links, or copies by the S3 server. An older store stays until the new one is complete.
@@ -23,12 +23,12 @@ def seal(run: RunPlace, /) -> int:
     rows = [("store", f"{address}: zarr.open or xarray.open_zarr reads it")]
     root = sealed_root(storage)
     if root is not None:
-        rows += _told(root)
+        rows += _part_rows(root)
     print_rows(f"sealed: {run}", rows)
     return 0
 
 
-def unseal(run: RunPlace, /) -> int:
+def unseal(run: RunPath, /) -> int:
     """Remove data.zarr. The run keeps every shard, and `datagen seal` makes the store again.
 
     For example: datagen unseal runs/first
@@ -42,20 +42,20 @@ def unseal(run: RunPlace, /) -> int:
         [("removed", f"{storage.url}/{SEALED}")] if was_there else [("nothing to do", f"no {SEALED} there")]
     )
     if root is not None:
-        rows += _told(root)
+        rows += _part_rows(root)
     print_rows(f"unsealed: {run}", rows)
     return 0
 
 
-def _told(root: SealedRoot) -> list[tuple[str, str]]:
+def _part_rows(root: SealedRoot) -> list[tuple[str, str]]:
     """Rows with the labels and the missing shards of each run in a store."""
     rows: list[tuple[str, str]] = []
     for part in root.parts:
-        head = f"run {part.spec_hash[:16]}"
+        title = f"run {part.spec_hash[:16]}"
         absent = part.missing_shards
         if absent:
             lacks = f"without {len(absent)} of its shards: {listed(absent)}"
-            rows.append((head, f"{counted(part.n, 'label')} wanted; {lacks}"))
+            rows.append((title, f"{counted(part.n, 'label')} wanted; {lacks}"))
         else:
-            rows.append((head, f"{counted(part.n, 'label')}, every shard"))
+            rows.append((title, f"{counted(part.n, 'label')}, every shard"))
     return rows

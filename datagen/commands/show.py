@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from datagen.configuration.arms import refuse_missing_packages
-from datagen.console.options import AS_FOUND, AssetSources, RunPlace, Whole, refuse_output
+from datagen.console.options import AS_FOUND, AssetSources, RunPath, Whole, refuse_output
 from datagen.console.printing import print_rows
 from datagen.drawing.arm_picture import draw_arm_picture
 from datagen.drawing.scene_picture import Shown, draw_scene_picture
@@ -20,7 +20,7 @@ _BEST = "best"
 
 
 def show(
-    run: RunPlace, /, *, out: Path, scene: Whole = 0, trial: str | None = None, given: AssetSources = AS_FOUND
+    run: RunPath, /, *, out: Path, scene: Whole = 0, trial: str | None = None, given: AssetSources = AS_FOUND
 ) -> int:
     """Draw a picture of one scene: the RGB-D frame, floor plans with the candidates, and numbers.
 

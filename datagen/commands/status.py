@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from datagen.console.command_lines import command_line
-from datagen.console.options import AsJson, RunPlace
+from datagen.console.options import AsJson, RunPath
 from datagen.console.printing import counted, listed, print_json, print_rows
 from datagen.jobs.job_report import health_line, job_report
 from datagen.reports.run_status import runs_report
@@ -13,31 +13,31 @@ from datagen.schemas.jobs import Jobs
 from datagen.schemas.storage import Storage, open_storage
 
 
-def status(run: RunPlace, /, *, stacks: bool = False, json: AsJson = False) -> int:
+def status(run: RunPath, /, *, stacks: bool = False, json: AsJson = False) -> int:
     """Show the progress of a run: shards, labels, jobs, failed attempts by cause, and quarantine.
 
-    Of merged runs it shows the sums, and one line per part.
+    For merged runs it shows the sums, and one line per part.
 
     For example: datagen status runs/first
 
     Args:
         stacks: Add one stack for each cause of failure.
     """
-    place = open_storage(run, probe=False, create=False)
-    report = runs_report(place, stacks)
+    storage = open_storage(run, probe=False, create=False)
+    report = runs_report(storage, stacks)
     if json:
-        print_json(report | {"jobs": [job_report(job) for job in Jobs(place).all()]})
+        print_json(report | {"jobs": [job_report(job) for job in Jobs(storage).all()]})
     else:
-        _print(run, place, report)
+        _print(run, storage, report)
     return 0
 
 
-def _print(name: str, place: Storage, report: dict[str, Any]) -> None:
+def _print(name: str, storage: Storage, report: dict[str, Any]) -> None:
     shards = report["shards"]
-    given_up = len(shards["quarantined"])
+    n_quarantined = len(shards["quarantined"])
     state = "complete" if report["complete"] else f"{counted(shards['missing'], 'shard')} missing"
-    if given_up:
-        state += f", {given_up} quarantined ({listed(shards['quarantined'])})"
+    if n_quarantined:
+        state += f", {n_quarantined} quarantined ({listed(shards['quarantined'])})"
     attempts = ", ".join(f"{outcome} {count}" for outcome, count in report["attempts"].items()) or "none"
     rows = [
         ("labels", f"{report['labels']:,} of {report['n']:,} ({report['label_source']})"),
@@ -54,7 +54,7 @@ def _print(name: str, place: Storage, report: dict[str, Any]) -> None:
         without = counted(report["attempts_without_end"], "attempt")
         rows.insert(3, ("unfinished", f"{without}: running or lost"))
     print_rows(f"run {name}", rows)
-    jobs = Jobs(place).all()
+    jobs = Jobs(storage).all()
     # The jobs that may be running, or else the latest.
     if shown := [job for job in jobs if job.health() in ("live", "silent")] or jobs[-1:]:
         print_rows("jobs", [(job.id, health_line(job)) for job in shown])
@@ -88,8 +88,8 @@ def _print_failures(name: str, report: dict[str, Any]) -> None:
     print_rows("causes", causes, ("cause", "attempts"))
     for cause, stack in report.get("stacks", {}).items():
         print_rows(cause, [(line, "") for line in stack.splitlines()])
-    if given_up := report["quarantine"]:
-        rows = [(str(q["shard"]), str(q["attempts"]), q["cause"]) for q in given_up[:20]]
+    if quarantine := report["quarantine"]:
+        rows = [(str(q["shard"]), str(q["attempts"]), q["cause"]) for q in quarantine[:20]]
         print_rows("quarantined", rows, ("shard", "attempts", "last cause"))
         again = command_line(["resume", name, "--quarantined"])
         print_rows(f"Try them again: {again}", [])

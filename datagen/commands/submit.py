@@ -18,7 +18,7 @@ from datagen.configuration.stored_scenes import (
     specify_again,
 )
 from datagen.console.command_lines import prints, words_of
-from datagen.console.options import File, Place, Whole
+from datagen.console.options import File, PathOrAddress, Whole
 from datagen.estimation.selected_candidates import SelectBy, SelectOptions, select_candidates
 from datagen.jobs.detach import detach_job
 from datagen.jobs.dry_run import PlannedRun, dry_run
@@ -27,7 +27,7 @@ from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.options import (
     JobKeywords,
     JobOptions,
-    absolute_place,
+    absolute_path,
     absolute_source,
     opening,
     refuse_odd_n,
@@ -67,11 +67,11 @@ def submit(
     /,
     *,
     n: Whole,
-    out: Place,
+    out: PathOrAddress,
     houses: str | None = None,
     objects: str | None = None,
-    scenes_from: Place | None = None,
-    candidates_from: Place | None = None,
+    scenes_from: PathOrAddress | None = None,
+    candidates_from: PathOrAddress | None = None,
     select: SelectBy | None = None,
     model: Annotated[Sequence[str | Path] | None, Parameter(metavar="PATH...")] = None,
     random_share: float = 0.2,
@@ -103,7 +103,7 @@ def submit(
         houses: builtin, procthor:DIR or ai2thor:DIR [builtin].
         objects: builtin or ycb:DIR [builtin].
         scenes_from: Run whose scenes and candidates are labelled again.
-        candidates_from: Run of whose candidates n are selected and labelled (plan, sim).
+        candidates_from: Run from whose candidates n are selected and labelled (plan, sim).
         select: Rule of the selection: nearest to the model's threshold (margin), in proportion to its entropy
             (uncertain), or where model and stored label differ (disagree) [random].
         model: Checkpoints for the selection; several: their mean.
@@ -124,7 +124,7 @@ def submit(
             `quiet` to report no progress.
 
     Returns:
-        What was done. The call blocks and reports progress on standard error.
+        The result of the job. The call blocks and reports progress on standard error.
 
     Raises:
         InputError: An option, a source or the run cannot be used.
@@ -160,13 +160,13 @@ def submit(
     load_label_source(label_source)  # InputError for an unknown one
     refuse_odd_n(n)
     job_options.refuse_bad()
-    said = {
+    given = {
         "--n": n,
-        "--out": absolute_place(out),
+        "--out": absolute_path(out),
         "--houses": houses and absolute_source(houses),
         "--objects": objects and absolute_source(objects),
-        "--scenes-from": scenes_from and absolute_place(scenes_from),
-        "--candidates-from": candidates_from and absolute_place(str(candidates_from)),
+        "--scenes-from": scenes_from and absolute_path(scenes_from),
+        "--candidates-from": candidates_from and absolute_path(str(candidates_from)),
         "--select": select,
         "--robot": robot,
         "--perturb": perturb,
@@ -180,7 +180,7 @@ def submit(
         "--noise": noise,
         "--config": config and config.expanduser().absolute(),
     }
-    words = ["submit", label_source, *words_of(said), *job_options.words()]
+    words = ["submit", label_source, *words_of(given), *job_options.words()]
     if selecting is not None:
         for path in selecting.models:
             words += ["--model", str(Path(path).expanduser().absolute())]
@@ -205,13 +205,16 @@ def submit(
             spec = specify(label_source, house_source, object_source, options, config, robot, perturb)
             world = assemble_world(spec, house_source, object_source, houses, objects)
             refuse_unusable_engines(spec, job_options.address)
-            if _layout_there(out) is None:
+            if _existing_layout(out) is None:
                 _refuse_no_scene(world, houses)
             source_url, layout, schema_version = "", layout_of(spec, n), None
         else:
-            mine = () if selecting is None else ("--seed", "--candidates-per-scene")
+            of_selection = () if selecting is None else ("--seed", "--candidates-per-scene")
             stored = open_stored_scenes(
-                stored_in, houses, objects, {name: said[name] for name in _OF_SCENES if name not in mine}
+                stored_in,
+                houses,
+                objects,
+                {name: given[name] for name in _OF_SCENES if name not in of_selection},
             )
             spec = specify_again(label_source, stored, config, robot, perturb)
             houses, objects = stored.houses, stored.objects
@@ -219,12 +222,12 @@ def submit(
             refuse_unusable_engines(spec, job_options.address)
             source_url, schema_version = stored.run.storage.url, stored.run.manifest.schema_version
             if selecting is None:
-                layout = _layout_there(out) or layout_again(spec, stored, n)
+                layout = _existing_layout(out) or layout_again(spec, stored, n)
                 selection = selection_of(stored.run)
                 refuse_too_few(stored, layout, n)
             else:
-                there = _run_there(out)
-                selected = select_candidates(spec, stored, n, selecting, there, job_options.json)
+                existing = _existing_run(out)
+                selected = select_candidates(spec, stored, n, selecting, existing, job_options.json)
                 spec, layout, n, selection = selected.spec, selected.layout, selected.n, selected.record
         sources = {"houses": absolute_source(houses), "objects": absolute_source(objects)}
         sources |= {"n_houses": str(len(world.house_ids)), "n_objects": str(len(world.object_names))}
@@ -235,7 +238,7 @@ def submit(
         run = None
         if planned is None:
             run = Run.create_or_open(open_storage(out), manifest, n, selection)
-    if said["--houses"] is None and not source_url:
+    if given["--houses"] is None and not source_url:
         Progress(job_options.json).say("note", {"note": _BUILTIN}, _BUILTIN)
     if planned is not None:
         return dry_run(out, [planned], job_options, began_s)
@@ -251,21 +254,21 @@ def submit(
 def _planned(out: str, manifest: Manifest, n: int, selection: Selection | None) -> PlannedRun:
     """The shards that the run at `out`, or a new one, lacks. InputError for another specification there."""
     sources = manifest.sources
-    places = sources["houses"], sources["objects"], sources.get("scenes_from", "")
-    run = _run_there(out)
+    references = sources["houses"], sources["objects"], sources.get("scenes_from", "")
+    run = _existing_run(out)
     if run is None:
-        return PlannedRun(manifest, None, n, manifest.layout.shards_for(n), *places, selection)
+        return PlannedRun(manifest, None, n, manifest.layout.shards_for(n), *references, selection)
     refuse_other(run.storage.url, run.manifest, manifest)
-    return planned_run(JobRun(run, *places), max(n, run.n))
+    return planned_run(JobRun(run, *references), max(n, run.n))
 
 
-def _layout_there(out: str) -> Layout | None:
+def _existing_layout(out: str) -> Layout | None:
     """The layout of the run at `out`; None where there is none yet. InputError for merged runs."""
-    run = _run_there(out)
+    run = _existing_run(out)
     return None if run is None else run.layout
 
 
-def _run_there(out: str) -> Run | None:
+def _existing_run(out: str) -> Run | None:
     """The run at `out`; None where there is none yet. InputError for merged runs."""
     try:
         storage = open_storage(out, probe=False, create=False)
@@ -278,7 +281,7 @@ def _run_there(out: str) -> Run | None:
 
 
 def _refuse_no_scene(world: World, houses: str) -> None:
-    """Sample a new run's first scene: InputError, before anything is written, where no scene can be made."""
+    """Raise InputError, before anything is written, where a new run's first scene cannot be made."""
     try:
         generate_scene(world, 0, StageClock())
     except InputError as error:
@@ -294,7 +297,7 @@ def _candidate_options(kind: str | None, per_scene: int | str | None) -> dict[st
             raise InputError("--candidates-per-scene", str(per_scene), "a grid has all its cells", fix)
         number = "grid"
     elif kind is not None and number == "grid":
-        problem = f"a whole grid has other cells than {kind} ones"
+        problem = f"a whole grid has cells that are not {kind}"
         raise InputError("--candidates", kind, problem, "Give --candidates-per-scene 60")
     within = kind if kind != "grid" else None
     return {"candidates.per_scene": number, "candidates.within": within}

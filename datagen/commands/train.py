@@ -13,8 +13,8 @@ from cyclopts import Parameter
 from pydantic import TypeAdapter, ValidationError
 
 from datagen.configuration.specify import parse_toml, read_toml
-from datagen.console.command_lines import Interrupted, prints, say_interrupted
-from datagen.console.options import AllowIncomplete, AsJson, File, Place, Places, Whole
+from datagen.console.command_lines import Interrupted, print_interrupted, prints
+from datagen.console.options import AllowIncomplete, AsJson, File, PathOrAddress, PathsOrAddresses, Whole
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.schemas.errors import InputError, choices
 
@@ -30,7 +30,7 @@ _FIX = "Give a TOML file as in docs/guides/train.md"
 
 
 def print_training(head: CheckpointHead | None, out: str | Path, json: bool, **_: Any) -> int:
-    """Print what a checkpoint holds; None where training was interrupted before it had one."""
+    """Print the content of a checkpoint; `head` is None where training was interrupted before it had one."""
     finished = head is not None and head.finished
     best = head.history[head.best_epoch - 1] if head and head.best_epoch else None
     if json:
@@ -51,7 +51,7 @@ def print_training(head: CheckpointHead | None, out: str | Path, json: bool, **_
         print_rows(f"{'finished' if finished else 'interrupted'}: {out}", list(_rows(head, best)))
     if finished:
         return 0
-    say_interrupted("; nothing is lost", sys.argv[1:])
+    print_interrupted("; nothing is lost", sys.argv[1:])
     return 130
 
 
@@ -82,7 +82,7 @@ def train_model(
     /,
     *,
     out: File,
-    val: Places | None = None,
+    val: PathsOrAddresses | None = None,
     init: File | None = None,
     model: Literal["paper", "shared", "n2m"] | None = None,
     model_config: Sequence[str] | None = None,
@@ -95,11 +95,11 @@ def train_model(
     seed: Whole = 0,
     patience: Whole = 8,
     augment: str | None = None,
-    encoded: Place | None = None,
+    encoded: PathOrAddress | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     processes: Whole | None = None,
     threads: Whole | None = None,
-    tensorboard: Place | None = None,
+    tensorboard: PathOrAddress | None = None,
     allow_incomplete: AllowIncomplete = False,
     allow_mixed_labels: bool = False,
     json: AsJson = False,
@@ -130,7 +130,7 @@ def train_model(
         seed: Seed of weights, order and dropout.
         patience: Epochs without a lower validation loss before training stops.
         augment: noise, holes, dropout, colour, rotation, comma-separated; or a TOML file.
-        encoded: Folder for inputs of `shared`, which are made there once; later trainings take them from it.
+        encoded: Folder for encoded inputs of `shared`: written once, read by later trainings.
         device: Device of the model.
         processes: Training processes [one per GPU; one on CPUs].
         threads: Threads per process [cores / processes].
@@ -140,7 +140,7 @@ def train_model(
         json: Report progress as JSON lines.
 
     Returns:
-        What the checkpoint says of itself.
+        The metadata of the checkpoint.
 
     Raises:
         InputError: An option or a run cannot be used.
@@ -244,11 +244,11 @@ def read_augmentation(word: str | None) -> tuple[Augmentation | None, dict[str, 
     from datagen.train.augment import Augmentation
 
     kinds = {name: get_args(kind)[0] for name, kind in get_type_hints(Augmentation).items()}
-    asked: dict[str, Any] = {name.strip(): {} for name in word.split(",")}
+    sections: dict[str, Any] = {name.strip(): {} for name in word.split(",")}
     if word.endswith(".toml"):
-        asked = read_toml(Path(word), _FIX)
+        sections = read_toml(Path(word), _FIX)
     effects: dict[str, Any] = {}
-    for name, values in asked.items():
+    for name, values in sections.items():
         if name not in kinds:
             raise InputError("--augment", name, "is not an effect", choices(kinds, name))
         known = {f.name for f in fields(kinds[name])}

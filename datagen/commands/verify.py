@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from datagen.console.options import AS_FOUND, AsJson, RunPlace, Sources, Whole
+from datagen.console.options import AS_FOUND, AsJson, RunPath, Sources, Whole
 from datagen.console.printing import counted, print_json, print_lines, print_rows, seconds, size
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
@@ -24,7 +24,7 @@ _SHOWN = 50  # of them on a terminal
 
 
 def verify(
-    run: RunPlace,
+    run: RunPath,
     /,
     *,
     deep: Whole = 0,
@@ -45,14 +45,14 @@ def verify(
     """
     if not 0 <= deep <= 1_000_000:
         raise InputError("--deep", str(deep), "is not between 0 and 1,000,000", "Give a number of samples")
-    place = open_storage(run, probe=False, create=False)
+    storage = open_storage(run, probe=False, create=False)
     checked, found = Checked(), Found()
     with counting("shards checked", as_json=json) as seen:
-        found.take(check_runs(place, checked, seen))
+        found.take(check_runs(storage, checked, seen))
     chosen = secrets.randbits(32) if seed is None else seed
     recomputed = deep > 0 and not found.damage
     if recomputed:
-        found.take(_deep(place, checked.runs, deep, chosen, given))
+        found.take(_deep(storage, checked.runs, deep, chosen, given))
     report = _report(run, checked, found)
     report["deep"] = {"asked": deep, "done": recomputed, "seed": chosen} if deep else None
     if json:
@@ -82,9 +82,9 @@ class Found:
         return self.counts.total() - self.counts["stale"]
 
 
-def _deep(place: Storage, runs: list[Run], count: int, seed: int, given: Sources) -> Iterator[Finding]:
+def _deep(storage: Storage, runs: list[Run], count: int, seed: int, given: Sources) -> Iterator[Finding]:
     """Findings of samples and scenes computed again, divided among the runs."""
-    # Simulators are imported only for --deep_check.
+    # Simulators are imported only for --deep.
     from datagen.regeneration.deep_check import deep_findings
     from datagen.regeneration.scenes import open_sources
 
@@ -93,7 +93,7 @@ def _deep(place: Storage, runs: list[Run], count: int, seed: int, given: Sources
     shares[: count % len(runs)] += 1
     for run, share in zip(runs, shares.tolist(), strict=True):
         origin = open_sources(run, given, needs_scenes=False)
-        folder = run.storage.url.removeprefix(place.url).strip("/")
+        folder = run.storage.url.removeprefix(storage.url).strip("/")
         for finding in deep_findings(run, share, origin, rng):
             yield replace(finding, key=f"{folder}/{finding.key}".strip("/"))
 
@@ -144,8 +144,8 @@ def _print(report: dict[str, Any], checked: Checked, found: Found) -> None:
     ]
     deep = report["deep"]
     if deep:
-        asked = deep["asked"]
-        done = f"{counted(asked, 'sample')} and {counted(asked, 'scene')} computed again"
+        count = deep["asked"]
+        done = f"{counted(count, 'sample')} and {counted(count, 'scene')} computed again"
         rows.append(
             ("deep", f"{done} (--seed {deep['seed']})" if deep["done"] else "not done: repair the run first")
         )

@@ -21,7 +21,7 @@ ARM_PACKAGES: dict[str, tuple[str, ...]] = {
 _NOT_FOR: dict[str, tuple[str, ...]] = {"plan": ("trial",), "sim": ()}
 # Reaches are stated in whole millimetres.
 _STEP_M = 0.001
-# Of the reaches that are drawn: opening an arm costs as much as planning ten candidates.
+# Step between sampled reaches: opening an arm of another reach costs as much as planning ten candidates.
 REACH_STEP_M = 0.01
 
 Fields = dict[str, Any]
@@ -110,13 +110,13 @@ def narrow_candidates(fields: Fields, robot: str) -> None:
 def refuse_unsuited(spec: Specification, robot: str, place: str, fix: str) -> None:
     """Raise InputError where candidates of this specification do not suit the robot."""
     limits, candidates = robot_limits(robot), spec.candidates
-    for field, asked, limit in (
+    for field, given, limit in (
         ("arm_reach_m", candidates.arm_reach_m, limits.reach_m),
         ("base_height_m", candidates.base_height_m, limits.base_height_m),
     ):
-        if limit is not None and not limit[0] - _STEP_M <= asked.low <= asked.high <= limit[1] + _STEP_M:
+        if limit is not None and not limit[0] - _STEP_M <= given.low <= given.high <= limit[1] + _STEP_M:
             has = f"{limit[0]:g} to {limit[1]:g} m" if limit[0] < limit[1] else f"{limit[0]:g} m"
-            problem = f"{asked.low:g} to {asked.high:g} m, and robot {robot} has {has}"
+            problem = f"{given.low:g} to {given.high:g} m, and robot {robot} has {has}"
             raise InputError(place, f"candidates.{field}", problem, fix)
     own_m = limits.base_radius_m
     if own_m is not None and candidates.base_radius_m < own_m - _STEP_M:

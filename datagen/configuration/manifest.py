@@ -1,6 +1,6 @@
 """The manifest of a new run: specification, layout, sources and versions.
 
-Apart from `specify`, whose options training reads where no label can be made.
+It is separate from `specify`, which training also uses where no label can be made.
 """
 
 from __future__ import annotations

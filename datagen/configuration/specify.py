@@ -1,4 +1,4 @@
-"""From options and a TOML file to a specification and a layout."""
+"""Make a specification and a layout from options and a TOML file."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def specify(
         narrow_candidates(fields, chosen)
     candidates = fields.setdefault("candidates", {})
     if isinstance(candidates, dict):
-        # A robot with a base of its own has that at every reach.
+        # A robot with a mobile base of its own has the same one at every reach.
         if chosen is None or robot_limits(chosen).base_radius_m is None:
             candidates.setdefault("scaled_base", True)
         if label_source in ARM_PACKAGES and "within" not in candidates:
@@ -84,7 +84,7 @@ def specify(
     }
     spec = validated(fields, place)
     if spec.candidates.per_scene == "grid" and spec.candidates.within is not None:
-        problem = f"a whole grid has other cells than {spec.candidates.within} ones"
+        problem = f"a whole grid has cells that are not {spec.candidates.within}"
         raise InputError(place, "candidates.within", problem, "Give --candidates-per-scene 60")
     if chosen is not None:
         refuse_unsuited(spec, chosen, place, "Correct the values, or choose another --robot")
@@ -120,7 +120,7 @@ def validated(fields: dict[str, Any], place: str) -> Specification:
 
 
 def first_of(error: ValidationError, place: str, *section: str) -> InputError:
-    """The first field that is wrong in a file, or in this section of it."""
+    """The InputError for the first wrong field of a file, or of a section of it."""
     first = error.errors()[0]
     field = ".".join((*section, *map(str, first["loc"])))
     fix = (
@@ -132,7 +132,7 @@ def first_of(error: ValidationError, place: str, *section: str) -> InputError:
 
 
 def layout_of(spec: Specification, n: int) -> Layout:
-    """Shards of about 32 scenes, of fewer in a small run so that workers share it evenly.
+    """The layout: shards of about 32 scenes, or fewer in a small run, so that workers share it evenly.
 
     A number of scenes that divides evenly is preferred, so that no label beyond n is made.
     """
@@ -168,7 +168,7 @@ def scene_engines(spec: Specification) -> dict[str, str]:
 def read_toml(
     path: Path, fix: str = "Give a TOML file as in docs/reference/specification.md"
 ) -> dict[str, Any]:
-    """What a TOML file holds. InputError, with `fix`, where it is none, too large or cannot be read."""
+    """The content of a TOML file. InputError, with `fix`, where it is not TOML, too large or unreadable."""
     data = read_regular(path, _MAX_CONFIG_BYTES, fix)
     try:
         return parse_toml(data.decode())

@@ -44,18 +44,18 @@ class StoredScenes:
 
 
 def open_stored_scenes(
-    place: str, houses: str | None, objects: str | None, given: Mapping[str, Any]
+    path: str, houses: str | None, objects: str | None, given: Mapping[str, Any]
 ) -> StoredScenes:
-    """Open the run at `place`. `given` are the options that decide scenes, by name: all must be unset.
+    """Open the run at `path`. `given` are the options that decide scenes, by name: all must be unset.
 
-    `houses` and `objects` are the sources now, None for those in the run's manifest. Raises InputError for an
-    option that would change scenes or candidates, and for a path without a run.
+    `houses` and `objects` are the present sources, None for those in the run's manifest. Raises InputError
+    for an option that would change scenes or candidates, and for a path without a run.
     """
     for option, value in given.items():
         if value is not None and value is not False:
             problem = "cannot change the scenes and candidates of --scenes-from"
             raise InputError(option, str(value), problem, f"Omit {option} or --scenes-from")
-    run = Run.open(place)
+    run = Run.open(path)
     _ = run.schema  # InputError for stores of another version, whose rows do not fit
     sources = run.manifest.sources
     return StoredScenes(
@@ -102,7 +102,7 @@ def specify_again(
         "scenes_from": {"spec_hash": before.scenes_hash},
         "engines": engines | label_engines(label_source),
     }
-    # Of selected candidates, the same ones.
+    # A run of selected candidates keeps its selection.
     spec = validated(fields, place).model_copy(update={"selection": before.selection})
     if suited is not None:
         fix = f"Make the scenes with `datagen submit heuristic --robot {suited}`, or choose another robot"
@@ -112,10 +112,10 @@ def specify_again(
 
 def layout_again(spec: Specification, stored: StoredScenes, n: int) -> Layout:
     """The layout of a new run of n labels, in shards that the stored scenes fill."""
-    per_scene, there = stored.candidates_per_scene, stored.available() // stored.candidates_per_scene
+    per_scene, available = stored.candidates_per_scene, stored.available() // stored.candidates_per_scene
     wanted = -(-n // per_scene)
     most = layout_of(spec, n).scenes_per_shard
-    fitting = next((k for k in range(most, 0, -1) if -(-wanted // k) * k <= there), 1)
+    fitting = next((k for k in range(most, 0, -1) if -(-wanted // k) * k <= available), 1)
     return Layout(scenes_per_shard=fitting, candidates_per_scene=per_scene)
 
 

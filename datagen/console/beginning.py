@@ -1,4 +1,4 @@
-"""When a command began, for the times that it reports."""
+"""The time at which a command began, for the durations that it reports."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _with_process: ContextVar[bool] = ContextVar("_with_process", default=False)
 
 @contextmanager
 def began_with_process() -> Generator[None]:
-    """In the block a command began with its process, so that imports are in its time."""
+    """Let a command of this block begin with its process, so that its time includes imports."""
     token = _with_process.set(True)
     try:
         yield
@@ -21,7 +21,7 @@ def began_with_process() -> Generator[None]:
 
 
 def beginning_s() -> float:
-    """By the monotonic clock: when this process began on the command line; else now."""
+    """Monotonic time at which a command began: its process on the command line, else now."""
     if not _with_process.get():
         return time.monotonic()
     import psutil

@@ -26,7 +26,7 @@ def prints(printer: Callable[..., int]) -> Callable[[Verb], Verb]:
 
 
 class Interrupted(KeyboardInterrupt):
-    """The command was asked to stop, and did so in order; `result` is what it would have returned."""
+    """The command stopped cleanly on request; `result` is what it would have returned."""
 
     def __init__(self, message: str, result: Any) -> None:
         self.result = result
@@ -54,7 +54,7 @@ def resume_with(words: Sequence[str]) -> str:
     return f"Resume with:\n  {command_line(words)}"
 
 
-def say_interrupted(how: str, words: Sequence[str]) -> None:
+def print_interrupted(how: str, words: Sequence[str]) -> None:
     """Print that the command was interrupted, and the command that resumes it."""
     sys.stderr.write(f"interrupted{how}. {resume_with(words)}\n")
 
@@ -65,5 +65,5 @@ def resumable(words: Sequence[str]) -> Generator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        say_interrupted("; committed shards are kept", words)
+        print_interrupted("; committed shards are kept", words)
         raise

@@ -32,10 +32,10 @@ def _whole_number(kind: Any, tokens: Sequence[Token]) -> int:
 # 180000, 180,000 or 1e5. A plain int would read 2.5 as 2.
 Whole = Annotated[int, Parameter(converter=_whole_number)]
 RUN = Parameter(name="RUN", help="Folder or s3:// address of a run or of merged runs.")
-RunPlace = Annotated[str, RUN]
-# The command line gives text. An address such as s3://bucket/run is no path.
-Place = Annotated[str | Path, Parameter(metavar="STR")]
-Places = Annotated[Sequence[str | Path], Parameter(metavar="STR...")]
+RunPath = Annotated[str, RUN]
+# The command line gives text. An address such as s3://bucket/run is not a `Path`.
+PathOrAddress = Annotated[str | Path, Parameter(metavar="STR")]
+PathsOrAddresses = Annotated[Sequence[str | Path], Parameter(metavar="STR...")]
 File = Annotated[str | Path, Parameter(metavar="PATH")]
 AllowIncomplete = Annotated[bool, Parameter(help="Accept runs that lack planned samples instead of failing.")]
 AsJson = Annotated[bool, Parameter(help="Print one JSON document to standard output.")]
@@ -71,7 +71,7 @@ class AssetSources:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Sources(AssetSources):
-    """The same, and the run whose scenes a run labelled again."""
+    """References of houses, objects and the run whose scenes a run labelled again."""
 
     scenes_from: Annotated[
         str | None, Parameter(help="New location of the run with the scenes [as in the run].")

@@ -26,7 +26,7 @@ def print_json(value: Any, indent: int | None = 2, to: TextIO | None = None) -> 
 
 
 def print_rows(title: str, rows: Sequence[Sequence[str]], heads: Sequence[str] = ()) -> None:
-    """Print a table. With heads: nothing without rows, and all columns but the first right-aligned."""
+    """Print a table. With `heads`: nothing without rows, and all columns but the first right-aligned."""
     if heads and not rows:
         return
     table = Table(show_header=bool(heads), box=None, padding=(0, 2, 0, 0))
@@ -37,7 +37,7 @@ def print_rows(title: str, rows: Sequence[Sequence[str]], heads: Sequence[str] =
     for row in rows:
         table.add_row(*(Text(printable(cell)) for cell in row))
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
-    # Printed apart: rich wraps a table's own title to the table's width.
+    # Printed separately: rich wraps a table's own title to the table's width.
     console.print(Text(printable(title), style="italic"), soft_wrap=True)
     console.print(table)
 

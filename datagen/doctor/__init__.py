@@ -50,7 +50,7 @@ def asset_checks(houses: str | None, objects: str | None) -> list[Check]:
 
 
 def extra_checks() -> list[Check]:
-    """One finding an extra: what it gives, and how to get it. Only `labels` is asked of a machine."""
+    """One check per extra: its features, and how to install it. Only `labels` is required."""
     checks: list[Check] = []
     for name, extra in EXTRAS.items():
         if missing := extra.missing():

@@ -21,7 +21,7 @@ assert actor.pose.p[2] < 1.0, "the cube does not fall"
 print("sapien " + importlib.metadata.version("sapien") + ", a cube falls")
 """
 
-# Creating the render system is what fails without a device.
+# Without a device, creating the render system fails.
 _SAPIEN_RENDER = """
 import importlib
 sapien = importlib.import_module("sapien")
@@ -51,7 +51,7 @@ TriangleMesh(scene, np.array([[[-1, -1, 0], [1, -1, 0], [0, 1, 0]]], np.float32)
 origin = np.array([[0, 0, 1]], np.float32)
 hit = scene.run(origin, np.array([[0, 0, -1]], np.float32))
 miss = scene.run(origin, np.array([[0, 0, 1]], np.float32))
-assert hit[0] == 0 and miss[0] == -1, "a ray goes astray"
+assert hit[0] == 0 and miss[0] == -1, "a ray cast has a wrong result"
 print("embreex " + importlib.metadata.version("embreex") + ", a ray hits")
 """
 
@@ -77,8 +77,8 @@ pinocchio.forwardKinematics(model, model.createData(), pinocchio.neutral(model))
 near, far = coal.Transform3s(), coal.Transform3s()
 far.setTranslation(importlib.import_module("numpy").array([3.0, 0.0, 0.0]))
 ball = coal.Sphere(1.0)
-ask = lambda other: coal.collide(ball, near, ball, other, coal.CollisionRequest(), coal.CollisionResult())
-assert ask(near) and not ask(far), "two balls do not meet as they should"
+hits = lambda other: coal.collide(ball, near, ball, other, coal.CollisionRequest(), coal.CollisionResult())
+assert hits(near) and not hits(far), "the collision check of two balls is wrong"
 print("pinocchio " + pinocchio.__version__ + ", coal " + importlib.metadata.version("coal"))
 """
 _ROBOT = """
@@ -120,7 +120,7 @@ def engine_checks() -> list[Check]:
 
 
 def probe_render_device() -> Probe:
-    """Whether SAPIEN finds a render device; which, or why not."""
+    """Probe for the render device of SAPIEN: its name, or why there is none."""
     return probe(_SAPIEN_RENDER)
 
 

@@ -30,7 +30,7 @@ _PREGRASP_M, _LIFT_M = 0.08, 0.10
 
 
 def main() -> int:
-    """Run the trial and print its outcome; the exit code."""
+    """Run the trial, print its outcome and return the exit code."""
     robot = open_robot("panda", None, _BASE_HEIGHT_M)
     cube = _block(0.0, _CUBE_M, _CUBE_M, -_CUBE_M / 2, _CUBE_M / 2)
     table = _block(_AHEAD_M + 0.1, 0.4, 0.8, 0.0, _TABLE_M)

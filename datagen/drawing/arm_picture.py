@@ -50,7 +50,7 @@ def draw_arm_picture(shown: Shown, out: Path) -> Lines:
     write_facts(columns[1], _candidates(samples))
     save_sheet(figure, out)
     best = best_success(samples)
-    words = "none" if best is None else f"candidate {best} at {shown.place(best)}"
+    words = "none" if best is None else f"candidate {best} at {shown.position_text(best)}"
     return [positives(samples), ("best success", words)]
 
 

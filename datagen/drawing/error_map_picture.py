@@ -1,4 +1,4 @@
-"""A picture of the floor around the target: where one label source is wrong about another."""
+"""A picture of the floor around the target: the errors of one label source against another."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def draw_error_maps(pairs: Sequence[dict[str, Any]], out: Path) -> None:
     figure = Figure(figsize=(3 * _WIDTH_IN, _HEIGHT_IN * len(pairs) + 0.5), layout="constrained")
     panels = figure.subplots(len(pairs), 3, squeeze=False)
     for row, pair in zip(panels, pairs, strict=True):
-        said, true = (name_of(pair[side]) for side in ("said_by", "true_by"))
-        if said == true:
-            said, true = "the first", "the second"
+        source, reference = (name_of(pair[side]) for side in ("said_by", "true_by"))
+        if source == reference:
+            source, reference = "the first", "the second"
         counts = _grid(pair["error_map"], "count")
         shown = np.where(counts >= MIN_COUNT, counts, np.nan)
         good, bad = LABEL_STYLES[1].colour, LABEL_STYLES[0].colour
@@ -45,13 +45,13 @@ def draw_error_maps(pairs: Sequence[dict[str, Any]], out: Path) -> None:
         # One scale for both kinds of error of a pair.
         highest = 10 * np.ceil(max(1, *(np.nan_to_num(share).max() for share in shares.values())) / 10)
         for axes, share, colour, only in (
-            (row[0], shares["false_positive"], bad, said),
-            (row[1], shares["false_negative"], good, true),
+            (row[0], shares["false_positive"], bad, source),
+            (row[1], shares["false_negative"], good, reference),
         ):
             title = f"only {only} calls it good"
             _draw_cells(axes, share, counts, colour, f"{title} (% of candidates)", float(highest))
         _draw_cells(row[2], np.where(counts > 0, counts, np.nan), counts, "#222222", "candidates", None)
-        row[0].set_ylabel(f"{said} against {true} ({set_name(pair['candidates'])})\ny [m]")
+        row[0].set_ylabel(f"{source} against {reference} ({set_name(pair['candidates'])})\ny [m]")
     words = f"Floor around the target, the nearest edge of its support below. Grey: under {MIN_COUNT} labels"
     figure.suptitle(f"{words}; pale: none", fontsize=11)
     with mpl.rc_context({"svg.hashsalt": "datagen", "svg.fonttype": "path"}):

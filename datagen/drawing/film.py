@@ -22,7 +22,7 @@ from datagen.workers.trials.trial import Recording
 
 Rows = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
-Told = tuple[tuple[int, str], ...]  # rows of a recording, with their names
+Moments = tuple[tuple[int, str], ...]  # rows of a recording, with their names
 
 _WIDE_M, _NEAR_M = 1.9, 0.8  # from the camera to the centre of the view
 _LINK_M, _NEAR_HALF_M = 0.07, 0.08  # around link origins in the far view, around the target in the near one
@@ -57,7 +57,7 @@ class Film:
     bodies: RobotBodies
     T_world_base: F64
     recording: Recording
-    told: Told  # the moments of a filmstrip
+    moments: Moments  # of a filmstrip
     wide_px: tuple[int, int]  # width and height of the far view
     near_px: tuple[int, int]
 
@@ -77,20 +77,20 @@ class Film:
     def shots(self) -> tuple[Shot, Shot]:
         """The far view of the whole trial, and the near one of the grasp."""
         recording, bodies, models = self.recording, self.bodies, self.recalled.models
-        named, last = {words: moment for moment, words in self.told}, len(recording.phase) - 1
+        named, last = {words: moment for moment, words in self.moments}, len(recording.phase) - 1
         shown = sorted({0, named.get("on the way", 0), named.get("at the grasp", (last + 1) // 2), last})
-        moments = [self.stage(moment) for moment in shown]
+        stages = [self.stage(moment) for moment in shown]
         hand = tuple(len(models) + k for k in bodies.hand)
         arm = tuple(len(models) + k for k in range(len(bodies.rays)) if bodies.link[k] >= 0)
-        origins_m = np.concatenate([stage.T_world_object[list(arm), :3, 3] for stage in moments])
+        origins_m = np.concatenate([stage.T_world_object[list(arm), :3, 3] for stage in stages])
         target_m = recording.T_world_object[shown, 0, :3, 3]
         target_m = target_m[np.linalg.norm(target_m - target_m[0], axis=1) < _FOLLOWED_M]
         around_m = np.concatenate([_around(origins_m, _LINK_M), _around(target_m, _LINK_M)])
         grasp_m = recording.T_world_object[0, :1, :3, 3] + [0.0, 0.0, 0.04]
         half_m = max(_NEAR_HALF_M, float(models[0].radius_m) + 0.03)
         house, forward = self.recalled.house.house, self.T_world_base[:3, 0]
-        wide = Subject(moments, ((arm, 1.0), (hand, 1.5), ((0,), 1.5)), around_m, forward)
-        near = Subject(moments[-2:], ((hand, 1.0), ((0,), 1.0)), _around(grasp_m, half_m), forward)
+        wide = Subject(stages, ((arm, 1.0), (hand, 1.5), ((0,), 1.5)), around_m, forward)
+        near = Subject(stages[-2:], ((hand, 1.0), ((0,), 1.0)), _around(grasp_m, half_m), forward)
         return (
             choose_shot(house, wide, _WIDE_M, *self.wide_px),
             choose_shot(house, near, _NEAR_M, *self.near_px),
@@ -106,22 +106,22 @@ class Film:
         return _PHASE_WORDS.get(self.recording.phase[moment], self.recording.phase[moment])
 
 
-def told_moments(recording: Recording) -> Told:
-    """The eight moments of a filmstrip as (row, name); gaps of one that ended early are filled."""
+def filmstrip_moments(recording: Recording) -> Moments:
+    """The eight moments of a filmstrip as (row, name); an early end leaves no gaps."""
     phase = np.array(recording.phase)
-    told: dict[int, str] = {}
+    names: dict[int, str] = {}
     for name, share, words in _MOMENTS:
         rows = np.flatnonzero(phase == name)
         if len(rows):
-            told.setdefault(int(rows[round(share * (len(rows) - 1))]), words)
+            names.setdefault(int(rows[round(share * (len(rows) - 1))]), words)
     last = len(phase) - 1
-    told.setdefault(last, _PHASE_WORDS.get(str(phase[last]), str(phase[last])))
-    while len(told) < min(len(_MOMENTS), len(phase)):
-        rows = sorted(told)
+    names.setdefault(last, _PHASE_WORDS.get(str(phase[last]), str(phase[last])))
+    while len(names) < min(len(_MOMENTS), len(phase)):
+        rows = sorted(names)
         gaps = np.diff(rows)
         middle = rows[int(np.argmax(gaps))] + int(gaps.max()) // 2
-        told[middle] = _PHASE_WORDS.get(str(phase[middle]), str(phase[middle]))
-    return tuple(sorted(told.items()))
+        names[middle] = _PHASE_WORDS.get(str(phase[middle]), str(phase[middle]))
+    return tuple(sorted(names.items()))
 
 
 class Lens:

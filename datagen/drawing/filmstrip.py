@@ -35,18 +35,18 @@ class Title:
 
 
 def write_sheet(film: Film, title: Title, out: Path) -> None:
-    """Moments in rows of four: the far view, below it the near one."""
-    told, text_px = film.told, _SHEET_TEXT_PX
+    """Write the moments in rows of four: the far view, below it the near one."""
+    moments, text_px = film.moments, _SHEET_TEXT_PX
     (w, h), (_, near_h) = film.wide_px, film.near_px
     top, caption_px = _title_px(title, text_px), 2 * round(1.3 * text_px) + _GAP_PX
     band = caption_px + h + near_h + 2 * _GAP_PX
-    columns = max(2, min(_COLUMNS, len(told)))  # two have room for the title
+    columns = max(2, min(_COLUMNS, len(moments)))  # two have room for the title
     width = _GAP_PX + columns * (w + _GAP_PX)
-    sheet = Image.new("RGB", (width, top + band * -(-len(told) // _COLUMNS)), _PAPER)
+    sheet = Image.new("RGB", (width, top + band * -(-len(moments) // _COLUMNS)), _PAPER)
     draw = ImageDraw.Draw(sheet)
     _write_title(draw, title, text_px)
-    views = pictures(film, [moment for moment, _ in told], _SHARPNESS)
-    for k, ((moment, words), (wide, near)) in enumerate(zip(told, views, strict=True)):
+    views = pictures(film, [moment for moment, _ in moments], _SHARPNESS)
+    for k, ((moment, words), (wide, near)) in enumerate(zip(moments, views, strict=True)):
         x = _GAP_PX + (k % _COLUMNS) * (w + _GAP_PX)
         y = top + (k // _COLUMNS) * band
         draw.rectangle((x, y, x + w - 1, y + 7), fill=_phase_colour(film, moment))
@@ -60,7 +60,7 @@ def write_sheet(film: Film, title: Title, out: Path) -> None:
 
 
 def write_motion(film: Film, title: Title, out: Path) -> None:
-    """The whole recording in real time at up to ten frames per second; the last one is shown longer."""
+    """Write the whole recording in real time, at up to ten frames per second; the last frame stays longer."""
     recording = film.recording
     seconds = float(recording.time_s[-1] - recording.time_s[0])
     count = int(np.clip(round(seconds * _FRAMES_PER_S) + 1, 2, min(_MOST_FRAMES, len(recording.time_s))))
@@ -85,7 +85,7 @@ def write_motion(film: Film, title: Title, out: Path) -> None:
 
 
 def _swatches(title: Title, width: int) -> U8:
-    """Areas of the colours that mean something, so large that a palette keeps them."""
+    """Areas of the colours with a meaning, large enough for a palette to keep them."""
     colours = [ImageColor.getrgb(colour)[:3] for colour in (title.colour, *PHASE_COLOURS.values())]
     kept = [*colours, OUTLINE_RGB, *map(_pale, PHASE_COLOURS.values())]
     return np.repeat(np.array(kept, np.uint8)[:, None, :], 60 * width, axis=1).reshape(-1, width, 3)
@@ -133,7 +133,7 @@ def _write_title(draw: ImageDraw.ImageDraw, title: Title, text_px: int) -> None:
 
 
 def _state(film: Film, moment: int) -> tuple[str, str]:
-    """Time, and what hand and target do; empty for poses that are no motion."""
+    """Time, and what hand and target do; empty for poses without motion."""
     recording = film.recording
     if recording.time_s[-1] == recording.time_s[0]:
         return "", ""

@@ -1,4 +1,4 @@
-"""The room from above with candidates by label, outcome or score, what marks them, and the legend."""
+"""The room from above with candidates by label, outcome or score, marks, and the legend."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from datagen.workers.scenes.reconstruct import ReconstructedScene
 _HEAD_ROOM_M = 1.9  # higher parts, such as the wall over a door, are not drawn
 _KIND_EDGE = {"wall": "#303030", "furniture": "#6b5b4a", "small": "#8a6fb0"}
 _DOT_PT2 = 26
-_SMALL_PT2 = {"out_of_reach": 9, "base_collision": 13}  # what fills most of a grid and says little
+_SMALL_PT2 = {"out_of_reach": 9, "base_collision": 13}  # frequent outcomes of little interest
 _REACH_COLOUR, _REACH_DASHES = "#1b3a6b", ((5, 3), (1, 1.5), (7, 2, 1, 2), (3, 1))
 _LEGEND_CHARACTERS = 40
 
@@ -43,9 +43,9 @@ Handle = Line2D | Patch
 
 
 def draw_plan(axes: Axes, recalled: ReconstructedScene, half_m: float, faded: bool = False) -> list[Style]:
-    """Draw house, placed objects and camera, `half_m` to each side of the target; returns what is seen.
+    """Draw house, placed objects and camera, `half_m` to each side of the target; returns the drawn styles.
 
-    `faded` makes the plan pale, so that the colours of candidates are read alone.
+    `faded` makes the plan pale, so that candidates stand out.
     """
     x, y = (float(v) for v in recalled.target_center_m[:2])
     for room in recalled.house.house.rooms:
@@ -75,7 +75,7 @@ def draw_plan(axes: Axes, recalled: ReconstructedScene, half_m: float, faded: bo
 
 
 def half_width_m(recalled: ReconstructedScene) -> float:
-    """Half the side of a plan that shows the camera, and candidates as far as they are usually drawn."""
+    """Half the side (m) of a plan that shows the camera and the usual range of candidates."""
     gap = np.abs(recalled.camera.T_world_camera[:2, 3] - recalled.target_center_m[:2]).max()
     return max(1.35, float(gap) + 0.3)
 
@@ -133,7 +133,7 @@ def draw_pick(axes: Axes, base_xy_m: F64, style: Style) -> None:
 
 
 def draw_reach(axes: Axes, target_xy_m: F64, radii_m: Sequence[tuple[str, float]]) -> list[Handle]:
-    """Draw the circle outside of which each (robot, radius) is too short; returns the legend."""
+    """Draw a circle around the target for each (robot, reach); returns the legend."""
     x, y = (float(v) for v in target_xy_m)
     legend: list[Handle] = []
     for k, (name, radius_m) in enumerate(radii_m):
@@ -202,7 +202,7 @@ def _handle(style: Style, text: str, filled: bool = True) -> Handle:
 
 
 def _plain(style: Style) -> str | Path:
-    """The marker as matplotlib takes it."""
+    """The marker as matplotlib accepts it."""
     return style.marker if isinstance(style.marker, str) else Path(np.array(style.marker))
 
 

@@ -38,7 +38,7 @@ class UsedGrasps:
 
 
 def used_grasps(T_target_tcp: F32) -> UsedGrasps:
-    """The different ones among N grasps (N, 4, 4), with their counts."""
+    """The distinct grasps among N grasps (N, 4, 4), with their counts."""
     rest = np.asarray(T_target_tcp, np.float64)
     kept: list[F64] = []
     counts: list[int] = []

@@ -1,4 +1,4 @@
-"""A stored scene beside the same scene replayed: frames, floor plans with the candidates, what differs."""
+"""A stored scene compared with its replay: frames, floor plans with the candidates, differences."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _draw_candidates(axes: Axes, side: Shown, row: int | None) -> tuple[list[Han
 
 
 def _draw_over(axes: Axes, stored: ReconstructedScene, made: ReconstructedScene) -> None:
-    """Both on one plan: where they are equal, dashes cover the solid line."""
+    """Draw both on one plan: where they are equal, dashes cover the solid line."""
     for recalled, style, name in ((stored, "-", "stored"), (made, "--", "replayed")):
         for k, outline in enumerate(object_outlines(recalled)):
             closed = np.vstack([outline, outline[:1]])

@@ -1,4 +1,4 @@
-"""A stored scene to draw, and its picture by the heuristic: frame, depth, floor plans, cloud, numbers."""
+"""A stored scene to draw, and its picture for heuristic labels: frame, depth, floor plans, cloud, numbers."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Lines = list[tuple[str, str]]  # printed next to a picture
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A scene of a run: its rows, and the scene made from them again."""
+    """A scene of a run: its rows, and the scene reconstructed from them."""
 
     run: str
     spec: Specification
@@ -58,7 +58,7 @@ class Shown:
         rng = generator(self.spec.seed, Stream.NOISE, self.recalled.index, self.recalled.retry)
         return render_frame(self.spec.observation, self.recalled.geometry, self.recalled.camera, rng)
 
-    def place(self, row: int) -> str:
+    def position_text(self, row: int) -> str:
         """Position of a candidate's base as text."""
         x, y = self.samples["base_xy_m"][row]
         return f"({x:.3f}, {y:.3f}) m"
@@ -99,12 +99,12 @@ def draw_scene_picture(shown: Shown, out: Path) -> Lines:
     write_facts(columns[0], _scene(shown))
     write_facts(columns[1], _candidates(samples))
     save_sheet(figure, out)
-    words = "none is clear" if best is None else f"{shown.place(best)}, H = {score[best]:.3f}"
+    words = "none is clear" if best is None else f"{shown.position_text(best)}, H = {score[best]:.3f}"
     return [positives(samples), ("best clear base", words)]
 
 
 def positives(samples: Columns) -> tuple[str, str]:
-    """How many candidates are positive."""
+    """The number of positive candidates, as (heading, text)."""
     return "positive", f"{int(samples['label'].sum())} of {len(samples['label'])} candidates"
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from datagen.drawing.arm_picture import best_success
-from datagen.drawing.film import Film, Told, told_moments
+from datagen.drawing.film import Film, Moments, filmstrip_moments
 from datagen.drawing.filmstrip import (
     MOTION_NEAR_PX,
     MOTION_WIDE_PX,
@@ -75,10 +75,10 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
     )
     sizes = (MOTION_WIDE_PX, MOTION_NEAR_PX) if moving else (SHEET_WIDE_PX, SHEET_NEAR_PX)
     bodies = robot_bodies(robot, float(shown.spec.candidates.radius_of_base_m(robot.reach_m)))
-    film = Film(shown.recalled, bodies, retrial.T_world_base, retrial.recording, retrial.told, *sizes)
+    film = Film(shown.recalled, bodies, retrial.T_world_base, retrial.recording, retrial.moments, *sizes)
     (write_motion if moving else write_sheet)(film, title, out)
     return [
-        ("candidate", f"{row} at {shown.place(row)}"),
+        ("candidate", f"{row} at {shown.position_text(row)}"),
         ("outcome", outcome),
         ("measured", _measured(retrial)),
     ]
@@ -122,14 +122,14 @@ def _measured(retrial: Retrial) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Retrial:
-    """The trial of a candidate. `recording` holds a trial, a plan, or the poses that were tried."""
+    """The repeated trial of a candidate. `recording` holds a trial, a plan, or tried poses."""
 
     robot: Robot
     T_world_base: F64  # (4, 4), true pose of the mount
     trial: CandidateTrial
     shown: int | None  # recorded row of `trial.results`; None where nothing was executed
     recording: Recording
-    told: Told  # the moments to show
+    moments: Moments  # to show
 
     @property
     def moves(self) -> bool:
@@ -152,13 +152,13 @@ def try_again(scene: SettledScene, candidates: SceneCandidates, row: int, spec: 
     recording = None if shown is None else trial.results[shown].recording
     if shown is not None and recording is not None:
         T_world_base = trial.T_world_base[shown]
-        kept = _with_sense(recording)
-        return Retrial(at.robot, T_world_base, trial, shown, kept, told_moments(kept))
+        kept = _finite_part(recording)
+        return Retrial(at.robot, T_world_base, trial, shown, kept, filmstrip_moments(kept))
     if trial.plan is not None:
         planned = planned_motion(at.robot, trial.plan, T_world_base, scene.T_world_object)
-        return Retrial(at.robot, T_world_base, trial, None, planned, told_moments(planned))
-    poses, told = _tried_poses(at, trial, T_world_base)
-    return Retrial(at.robot, T_world_base, trial, None, poses, told)
+        return Retrial(at.robot, T_world_base, trial, None, planned, filmstrip_moments(planned))
+    poses, moments = _tried_poses(at, trial, T_world_base)
+    return Retrial(at.robot, T_world_base, trial, None, poses, moments)
 
 
 def planned_motion(robot: Robot, plan: MotionPlan, T_world_base: F64, T_world_object: F64) -> Recording:
@@ -183,7 +183,7 @@ def planned_motion(robot: Robot, plan: MotionPlan, T_world_base: F64, T_world_ob
     )
 
 
-def _tried_poses(at: ArmInScene, trial: CandidateTrial, T_world_base: F64) -> tuple[Recording, Told]:
+def _tried_poses(at: ArmInScene, trial: CandidateTrial, T_world_base: F64) -> tuple[Recording, Moments]:
     """The tucked arm and, where planning failed later, the arm at grasps with an IK solution."""
     robot = at.robot
     q_rad, opening_m, words = [robot.homes_rad[0]], [robot.gripper.max_opening_m], ["tucked"]
@@ -211,7 +211,7 @@ def _tried_poses(at: ArmInScene, trial: CandidateTrial, T_world_base: F64) -> tu
     return recording, tuple(enumerate(words))
 
 
-def _with_sense(recording: Recording) -> Recording:
+def _finite_part(recording: Recording) -> Recording:
     """The part of the recording with finite numbers; unstable physics cannot be drawn."""
     finite = np.isfinite(recording.q_rad).all(1) & np.isfinite(recording.T_world_object).all((1, 2, 3))
     n = int(np.argmin(np.append(finite, False)))

@@ -1,6 +1,6 @@
 """Predictions of dear labels from cheap labels and stored numbers, fitted on other scenes.
 
-A binary cheap label says little; a regression on the numbers that it comes with says more. Each scene's
+A binary cheap label predicts little; a regression on the numbers stored with it predicts more. Each scene's
 predictions come from folds without it, so that they are as good for scenes with dear labels as for others
 (Zrnic and Candes, "Cross-prediction-powered inference", arXiv 2309.16598).
 """

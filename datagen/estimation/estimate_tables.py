@@ -64,8 +64,8 @@ def _print_further(report: dict[str, Any], known: list[dict[str, Any]]) -> None:
 def _further(row: dict[str, Any]) -> tuple[str, str, str]:
     if row["further_labels"] is None:
         return "no number", "-", "more cheap labels are needed first"
-    enough = "as there are" if row["scenes_suffice"] else "more than there are"
-    return f"{row['further_labels']:,}", seconds(row["further_cpu_s"]), enough
+    scenes = "enough" if row["scenes_suffice"] else "more are needed"
+    return f"{row['further_labels']:,}", seconds(row["further_cpu_s"]), scenes
 
 
 def _rate(row: dict[str, Any]) -> str:

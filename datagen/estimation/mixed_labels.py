@@ -23,7 +23,7 @@ from datagen.workers.bases.candidate_sets import CANDIDATE_SETS, in_set
 Array = npt.NDArray[Any]
 
 _KEYS = ("sample_scene_index", "candidate_index")
-# Numbers of a candidate that say something about its label.
+# Numbers of a candidate that help to predict its label.
 NUMBERS = (
     *("heuristic_score", "visibility", "distance_m", "mount_distance_m"),
     *("arm_reach_m", "base_height_m", "base_clearance_m"),
@@ -66,7 +66,7 @@ class MixedLabels:
         return in_set(candidates, self.is_clear, mount_distance_m, reach_m).astype(np.float64)
 
     def fitted(self) -> MixedLabels:
-        """The same with one cheap column: a prediction from the cheap labels and NUMBERS.
+        """These labels with one cheap column: a prediction from the cheap labels and NUMBERS.
 
         Unchanged where too few scenes have dear labels for it.
         """
@@ -86,11 +86,11 @@ def source_name(spec: Specification) -> str:
 def read_mixed(cheap: Sequence[str], dear: Sequence[str]) -> MixedLabels:
     """Join the labels of the runs at these paths.
 
-    Every candidate that all cheap sources labelled is in the population, and so are whole scenes within the
-    runs' n alone. InputError where runs are not over the same candidates, or a source labelled them twice.
+    The population has every candidate that all cheap sources labelled, in whole scenes within the runs' n.
+    InputError where runs are not over the same candidates, or a source labelled them twice.
     """
-    cheap_runs = [run for place in cheap for run in open_runs(place)]
-    dear_runs = [run for place in dear for run in open_runs(place)]
+    cheap_runs = [run for path in cheap for run in open_runs(path)]
+    dear_runs = [run for path in dear for run in open_runs(path)]
     names = tuple(dict.fromkeys(source_name(run.manifest.spec) for run in cheap_runs))
     dear_names = list(dict.fromkeys(source_name(run.manifest.spec) for run in dear_runs))
     if len(dear_names) > 1:
@@ -144,27 +144,27 @@ def _join(of_scenes: dict[str, Run], names: Sequence[str], dear_name: str) -> di
     rows = [np.searchsorted(table["key"], keys) for table in tables]
     first = {name: values[rows[0]] for name, values in tables[0].items()}
     scenes, scene = np.unique(keys // _CANDIDATES, return_inverse=True)
-    place = np.searchsorted(keys, dear["key"])
-    place[place == len(keys)] = 0
-    known = keys[place] == dear["key"]
+    position = np.searchsorted(keys, dear["key"])
+    position[position == len(keys)] = 0
+    known = keys[position] == dear["key"]
     if not known.any():
         url, other = dear_run.storage.url, of_scenes[names[0]].storage.url
         problem = f"none of its candidates is in {other}"
         raise InputError(url, "candidate_index", problem, "Make more labels of the cheap run")
     probability = np.ones(len(keys))
     if selection:
-        probability[place[known]] = dear["selection_probability"][known]
+        probability[position[known]] = dear["selection_probability"][known]
     else:
-        # Scenes of a run are alike and independent, so that the first ones are as good as random ones.
-        probability[:] = len(np.unique(scene[place[known]])) / len(scenes)
+        # Scenes of a run are independent and identically distributed: the first ones are a random sample.
+        probability[:] = len(np.unique(scene[position[known]])) / len(scenes)
     is_dear, label = np.zeros(len(keys), np.bool_), np.zeros(len(keys), np.bool_)
-    is_dear[place[known]] = True
-    label[place[known]] = dear["label"][known] == 1
+    is_dear[position[known]] = True
+    label[position[known]] = dear["label"][known] == 1
     _, robot = np.unique(scene * _CANDIDATES + first["robot_index"], return_inverse=True)
     return {
         "sample_id": first["sample_id"],
         "base_is_clear": first["base_is_clear"],
-        # As stored: a candidate at the edge of the reach is within it by these numbers.
+        # As stored: these numbers decide whether a candidate at the edge of the reach is within it.
         "numbers": np.stack([first[name] for name in NUMBERS], axis=1).astype(np.float64),
         "cheap": np.stack([t["label"][at] for t, at in zip(tables, rows, strict=True)], 1).astype(np.float64),
         "scene": scene.astype(np.int64),
@@ -176,7 +176,7 @@ def _join(of_scenes: dict[str, Run], names: Sequence[str], dear_name: str) -> di
 
 
 def _stacked(blocks: Sequence[dict[str, Array]]) -> dict[str, Array]:
-    """The blocks one after the other, with scenes and robots numbered on."""
+    """The blocks one after the other, with scenes and robots numbered consecutively."""
     for numbered in ("scene", "robot"):
         first = 0
         for block in blocks:

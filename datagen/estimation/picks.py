@@ -38,7 +38,7 @@ class Scored:
 
 
 def open_methods(names: Sequence[str]) -> list[EvaluatedMethod]:
-    """Checkpoints by their files and baselines by their names. InputError for others, and where to fit."""
+    """Open checkpoints by file and baselines by name. InputError for others, and for baselines to fit."""
     files = [name for name in names if Path(name).is_file()]
     rules = [name for name in names if name not in files]
     for name in rules:
@@ -60,17 +60,17 @@ def score_population(
     """Score every candidate of the population by every method, with progress on standard error.
 
     InputError where a model was trained on a house of the population: its scores would be better there than
-    elsewhere, and the estimate with them wrong.
+    elsewhere, and would bias the estimate.
     """
     if not methods:
         return []
-    places = [run.storage.url for run in labels.runs_of(labels.cheap_names[0])]
-    scores = score_candidates(places, labels.sample_id, methods, json, _refuse_seen)
+    paths = [run.storage.url for run in labels.runs_of(labels.cheap_names[0])]
+    scores = score_candidates(paths, labels.sample_id, methods, json, _refuse_seen)
     return [Scored(method, scores[method.name]) for method in methods]
 
 
 def score_candidates(
-    places: Sequence[str],
+    paths: Sequence[str],
     sample_id: npt.NDArray[np.void],
     methods: Sequence[EvaluatedMethod],
     json: bool = False,
@@ -85,13 +85,13 @@ def score_candidates(
     known = sample_id[order]
     streams = [
         SampleStream(
-            [place],
+            [path],
             scenes_per_batch=SCENES_PER_BATCH,
             extra=FIELDS,
             shuffle=False,
             allow_incomplete=True,
         )
-        for place in places
+        for path in paths
     ]
     for method in methods:
         for stream in streams:
@@ -101,10 +101,10 @@ def score_candidates(
         for stream in streams:
             for batch in stream.epoch(0):
                 ids = np.ascontiguousarray(batch.sample_id).view("V16").ravel()
-                place = np.minimum(np.searchsorted(known, ids), len(known) - 1)
-                there = known[place] == ids
+                position = np.minimum(np.searchsorted(known, ids), len(known) - 1)
+                there = known[position] == ids
                 for method in methods:
-                    scores[method.name][order[place[there]]] = scored(method.scorer, batch)[there]
+                    scores[method.name][order[position[there]]] = scored(method.scorer, batch)[there]
                 done += len(batch.clouds)
                 seen(done, total)
     return scores
@@ -127,7 +127,7 @@ def with_models(labels: MixedLabels, scores: Sequence[Scored]) -> MixedLabels:
 def _refuse_seen(stream: SampleStream, method: EvaluatedMethod) -> None:
     shared = sorted(stream.house_ids() & method.houses)
     if shared:
-        place = stream.parts[0].part.place
-        problem = f"was trained on {shared[0]!r} and {len(shared) - 1} more houses of {place}"
+        path = stream.parts[0].part.place
+        problem = f"was trained on {shared[0]!r} and {len(shared) - 1} more houses of {path}"
         fix = "Train it on another split, or estimate on runs of another split"
         raise InputError(method.place, "house_id", problem, fix)

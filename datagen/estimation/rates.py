@@ -17,9 +17,9 @@ from scipy import stats
 from datagen.train.inputs import F64, I64, Bools
 
 LEVEL = 0.95
-# Below this share of its variance between scenes, a difference to the population is none.
+# A difference to the population below this share of its variance between scenes counts as none.
 _NO_DIFFERENCE = 1e-9
-# Scenes with dear labels for each cheap column: the coefficient of fewer costs more than it brings.
+# Scenes with dear labels for each cheap column: with fewer, a coefficient raises the variance.
 _SCENES_A_COLUMN = 20
 
 
@@ -28,7 +28,7 @@ class Population:
     """N candidates of M scenes; scenes are numbered from 0, each has a row.
 
     `cheap` has a column for each of P cheap sources. `probability` is that with which a candidate was
-    selected for a dear label, the scene's included. Where `is_dear` is false, it and `label` mean nothing.
+    selected for a dear label, the scene's included. It and `label` are undefined where `is_dear` is false.
     """
 
     n_scenes: int
@@ -58,7 +58,7 @@ class RateEstimate:
     """The rate of the dear labels in a population, from all labels and from the dear ones alone.
 
     `weights` are the coefficients of the cheap columns. The variance is `dear_part` / `dear_scenes` plus
-    `cheap_part`, which more dear labels do not lessen.
+    `cheap_part`, which more dear labels do not reduce.
     """
 
     mixed: Interval
@@ -79,7 +79,7 @@ class RateEstimate:
         return self.dear_labels * self.dear_alone.variance / self.mixed.variance
 
     def growth(self, half_width: float) -> float:
-        """Factor by which dear labels must become more for this half width, at least 1.
+        """Factor, at least 1, by which the number of dear labels must grow for this half width.
 
         inf where the cheap labels' part of the variance alone is too large.
         """
@@ -173,7 +173,7 @@ def _weights(differences: F64, with_dear: F64, between: F64, most: int) -> F64:
 
     `differences` (P, P) is the variance of the cheap rates' difference between the dear labels and the whole
     population, `with_dear` (P,) its covariance with the dear rate. A column that does not vary, or that the
-    others explain, has the coefficient 0; so has every one where all candidates have dear labels.
+    others explain, has the coefficient 0; all are 0 where all candidates have dear labels.
     """
     kept: list[int] = []
     for column in range(len(with_dear)):

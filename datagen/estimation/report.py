@@ -27,15 +27,15 @@ def estimation_report(
     spending = account_for(labels.dear_runs)
     spent_s = spending.useful.cpu_s + sum(account.cpu_s for account in spending.waste.values())
     cpu_s_per_label = spent_s / spending.labels if spending.labels else 0.0
-    by = labels.fitted()
+    fitted = labels.fitted()
     populations: list[tuple[str, F64]] = [(name, labels.member(name)) for name in sets]
     populations += [(f"picks of {method.name}", method.member(labels)) for method in scores]
     estimates: list[dict[str, Any]] = []
     for name, member in populations:
-        found = estimate_rate(by.population, member)
+        found = estimate_rate(fitted.population, member)
         estimates.append(
             {"population": name, "candidates": float(member.sum())}
-            | ({"rate": None} if found is None else _said(found, by, half_width, cpu_s_per_label))
+            | ({"rate": None} if found is None else _rate_record(found, fitted, half_width, cpu_s_per_label))
             | {"cheap_rates": _rates(labels, member)}
         )
     return {
@@ -53,10 +53,10 @@ def estimation_report(
     }
 
 
-def _said(
+def _rate_record(
     found: RateEstimate, labels: MixedLabels, half_width: float | None, cpu_s_per_label: float
 ) -> dict[str, Any]:
-    said: dict[str, Any] = {
+    record: dict[str, Any] = {
         **_interval(found.mixed),
         "dear_alone": _interval(found.dear_alone),
         "weights": dict(zip(labels.cheap_names, found.weights, strict=True)),
@@ -65,16 +65,16 @@ def _said(
         "effective_labels": found.effective_labels,
     }
     if half_width is not None:
-        # Scenes cannot be labelled in part, so that the whole runs grow.
+        # Scenes cannot be labelled in part: all labels grow, not only those of the population.
         factor = found.growth(half_width)
         more = None if math.isinf(factor) else math.ceil((factor - 1) * labels.population.is_dear.sum())
         scenes = None if math.isinf(factor) else math.ceil(factor * found.dear_scenes)
-        said |= {
+        record |= {
             "further_labels": more,
             "further_cpu_s": None if more is None else more * cpu_s_per_label,
             "scenes_suffice": scenes is not None and scenes <= found.scenes,
         }
-    return said
+    return record
 
 
 def _rates(labels: MixedLabels, member: F64) -> dict[str, float | None]:

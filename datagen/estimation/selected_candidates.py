@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from datagen.evaluation_report.methods import EvaluatedMethod
 
 SelectBy = Literal["random", "margin", "uncertain", "disagree"]
-# Share of a scene's candidates that is selected by default.
+# By default, 1 / _SHARE of a scene's candidates is selected.
 _SHARE = 4
 
 
@@ -53,7 +53,7 @@ class SelectOptions:
 
 @dataclass(frozen=True)
 class SelectedCandidates:
-    """What a run of n selected candidates is made from; `record` is None where the run has it already."""
+    """Specification, layout and selection of a run of n candidates; `record` is None where the run has it."""
 
     spec: Specification
     layout: Layout
@@ -64,10 +64,10 @@ class SelectedCandidates:
 def select_candidates(
     spec: Specification, stored: StoredScenes, n: int, options: SelectOptions, out: Run | None, json: bool
 ) -> SelectedCandidates:
-    """Select at least n candidates of a run, and return what a run of them is made from.
+    """Select at least n candidates of a run, and return the specification of a run of them.
 
     The run at `out` keeps its selection where the options are those that it was made with. More than n are
-    selected where whole scenes fill whole shards. InputError where the run has fewer candidates.
+    selected to fill whole scenes and shards. InputError where the run has fewer candidates.
     """
     source = stored.run
     size = source.layout.candidates_per_scene
@@ -89,18 +89,18 @@ def select_candidates(
     }
     before = None if out is None else out.manifest.spec.selection
     if out is not None and before is not None:
-        there = before.model_dump(include=set(chosen))
-        if there == chosen and n <= out.n:
+        existing = before.model_dump(include=set(chosen))
+        if existing == chosen and n <= out.n:
             return SelectedCandidates(_with(spec, before), out.layout, out.n, None)
-        if there == chosen:
+        if existing == chosen:
             problem = f"is more than the {out.n:,} candidates that {out.storage.url} selected"
             raise InputError("--n", str(n), problem, "Select others into another --out")
     available = min(stored.available() // size, source.n // size)
     layout = _layout(spec, -(-n // per_scene), per_scene, available)
     scenes = layout.shards_for(n) * layout.scenes_per_shard
     if scenes > available:
-        there = f"{source.storage.url} has {available:,}"
-        problem = f"needs {scenes:,} scenes of {per_scene} candidates, but {there}"
+        has = f"{source.storage.url} has {available:,}"
+        problem = f"needs {scenes:,} scenes of {per_scene} candidates, but {has}"
         raise InputError("--n", str(n), problem, "Ask for fewer labels, or for more --candidates-per-scene")
     selection = _select(stored, available, scenes, per_scene, by, options, methods, json)
     params = SelectionParams.model_validate(chosen | {"scenes": available, "sha256": selection.digest()})
@@ -140,7 +140,7 @@ def _select(
     methods: Sequence[EvaluatedMethod],
     json: bool,
 ) -> Selection:
-    # Imported here: making labels needs none of what reads and scores them.
+    # Imported here: only a selection needs the code that reads and scores labels.
     from datagen.estimation.two_stage_sampling import all_alike, draw_sample
     from datagen.estimation.unsureness import design_by, read_unsure
 

@@ -25,7 +25,7 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """What a method wants: probabilities of scenes (M,), and of candidates in their scene (M, K)."""
+    """The probabilities that a method wants: of scenes (M,), and of candidates in their scene (M, K)."""
 
     scene: F64
     candidate: F64
@@ -56,12 +56,12 @@ def in_proportion(size: F64, n_scenes: int, per_scene: int) -> Design:
 def draw_sample(
     design: Design, n_scenes: int, per_scene: int, random_share: float, rng: np.random.Generator
 ) -> Sample:
-    """Draw S scenes of M and k candidates of K in each; `random_share` of each probability is that of all."""
+    """Draw S scenes of M and k candidates of K in each; `random_share` weights equal probabilities."""
     scenes, size = design.candidate.shape
     equal = n_scenes / scenes
     wanted = (1 - random_share) * design.scene
     of_scene = wanted + random_share * equal
-    # A scene that was drawn as one of all has candidates as any; one that was wanted, those wanted.
+    # The equal part of a scene's probability has equal candidates, the wanted part those wanted.
     within = wanted[:, None] * design.candidate + random_share * equal * per_scene / size
     within /= of_scene[:, None]
     chosen = _systematic(of_scene, n_scenes, rng)
@@ -81,7 +81,7 @@ def _first(score: F64, n: int, rng: np.random.Generator) -> F64:
 def _in_proportion(size: F64, n: int) -> F64:
     """Probabilities (N,) that sum to n <= N, in proportion to sizes where that is at most 1."""
     probability = np.zeros(len(size))
-    # Sizes of 0 share what the others leave.
+    # Units of size 0 share the remaining probability equally.
     positive = size > 0
     if positive.sum() <= n:
         probability[positive] = 1.0

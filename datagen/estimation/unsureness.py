@@ -1,4 +1,4 @@
-"""How unsure models are about the label of each candidate of a run."""
+"""The uncertainty of models about the label of each candidate of a run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ By = Literal["margin", "uncertain", "disagree"]
 
 
 def unsureness(by: By, chance: F64, threshold: float, label: F64) -> F64:
-    """Return how much a dear label is wanted, from a model's chance of success and a cheap label, both (N,).
+    """Return the priority (N,) of dear labels, from a model's chance of success and a cheap label, both (N,).
 
     `margin`: minus the distance to the threshold. `uncertain`: the entropy in bits. `disagree`: 1 where model
     and cheap label decide otherwise, else 0.
@@ -46,7 +46,7 @@ def read_unsure(
 ) -> F64:
     """Return the unsureness (M, K) of every candidate of the first M scenes of a run, by the methods' mean.
 
-    InputError where not every scene of these is committed.
+    InputError where one of these scenes is not committed.
     """
     size = run.layout.candidates_per_scene
     columns = read_whole_scenes(run, ("sample_scene_index", "candidate_index", "sample_id", "label"))

@@ -1,4 +1,4 @@
-"""The runs on which methods are evaluated: what they hold, and that no method was trained on it."""
+"""The runs on which methods are evaluated: their contents, and checks that no method was trained on them."""
 
 from __future__ import annotations
 
@@ -58,30 +58,30 @@ class EvaluatedRun:
         }
 
 
-def split_paths(places: Sequence[str]) -> tuple[list[str], list[str]]:
+def split_paths(paths: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return (checkpoints, runs): files are checkpoints; folders and s3:// addresses are runs.
 
     `released` is the checkpoint of the released model, unless there is a file or folder of that name.
     """
     checkpoints: list[str] = []
     runs: list[str] = []
-    for place in places:
-        if "://" in place or Path(place).is_dir():
-            runs.append(place)
-        elif Path(place).is_file():
-            checkpoints.append(place)
-        elif place == RELEASED:
+    for path in paths:
+        if "://" in path or Path(path).is_dir():
+            runs.append(path)
+        elif Path(path).is_file():
+            checkpoints.append(path)
+        elif path == RELEASED:
             checkpoints.append(str(released_checkpoint()))
         else:
             fix = "Name checkpoints of `datagen train` and runs of `datagen submit sim`"
-            raise InputError(place, "", "is neither a checkpoint file nor a run folder", fix)
+            raise InputError(path, "", "is neither a checkpoint file nor a run folder", fix)
     if not runs:
         raise InputError("datagen evaluate", "PATH", "no run is given", "Name one or more run folders")
     return checkpoints, runs
 
 
 def open_evaluated_runs(
-    places: Sequence[str], allow_incomplete: bool = False, allow_mixed_labels: bool = False
+    paths: Sequence[str], allow_incomplete: bool = False, allow_mixed_labels: bool = False
 ) -> list[EvaluatedRun]:
     """Open the runs.
 
@@ -91,58 +91,58 @@ def open_evaluated_runs(
     opened: list[EvaluatedRun] = []
     by_scenes: dict[str, str] = {}
     kinds: dict[str, str] = {}
-    for place in places:
-        refuse_no_trials(place)
-        specs = tuple(run.manifest.spec for run in open_runs(place))
+    for path in paths:
+        refuse_no_trials(path)
+        specs = tuple(run.manifest.spec for run in open_runs(path))
         for spec in specs:
-            _refuse_other_labels(place, spec.label_source, kinds)
+            _refuse_other_labels(path, spec.label_source, kinds)
             other = by_scenes.setdefault(spec.scenes_hash, spec.hash())
             if other != spec.hash():
                 problem = "are also in another run of this command, with other labels"
-                raise InputError(place, "scenes", problem, "Evaluate the two runs separately")
+                raise InputError(path, "scenes", problem, "Evaluate the two runs separately")
         extra = tuple(dict.fromkeys((*EXTRA, *FIELDS)))
         stream = SampleStream(
-            [place],
+            [path],
             scenes_per_batch=SCENES_PER_BATCH,
             extra=extra,
             shuffle=False,
             allow_incomplete=allow_incomplete,
         )
-        opened.append(EvaluatedRun(place, specs, stream))
+        opened.append(EvaluatedRun(path, specs, stream))
     if not allow_mixed_labels:
         refuse_mixed_labels([(run.place, spec) for run in opened for spec in run.specs])
     return opened
 
 
-def refuse_no_trials(place: str) -> None:
+def refuse_no_trials(path: str) -> None:
     """Raise InputError where a run's labels are neither sim nor plan."""
-    for run in open_runs(place):
+    for run in open_runs(path):
         source = run.manifest.spec.label_source
         if source not in _WITH_OUTCOMES:
             problem = f"is {source}, but methods are evaluated on simulated labels"
-            raise InputError(place, "label_source", problem, "Name a run of `datagen submit sim` or plan")
+            raise InputError(path, "label_source", problem, "Name a run of `datagen submit sim` or plan")
 
 
-def _refuse_other_labels(place: str, source: str, kinds: dict[str, str]) -> None:
-    kinds.setdefault(source, place)
+def _refuse_other_labels(path: str, source: str, kinds: dict[str, str]) -> None:
+    kinds.setdefault(source, path)
     if len(kinds) > 1:
         (first, at), (second, _) = kinds.items()
         problem = f"is {second}, but {at} has {first} labels"
-        raise InputError(place, "label_source", problem, "Evaluate the two runs separately")
+        raise InputError(path, "label_source", problem, "Evaluate the two runs separately")
 
 
-def candidate_sets_of(runs: Sequence[EvaluatedRun], asked: Sequence[str]) -> dict[str, tuple[int, ...]]:
-    """The candidate sets to report, those asked for or all, each with the runs that offer it.
+def candidate_sets_of(runs: Sequence[EvaluatedRun], requested: Sequence[str]) -> dict[str, tuple[int, ...]]:
+    """The candidate sets to report, requested or all, each with the runs that offer it.
 
     A run of in-range candidates covers only those; a run of whole grids covers every set.
     """
     by_name = {n: tuple(k for k, run in enumerate(runs) if n in run.offers) for n in CANDIDATE_SETS}
     offered = {name: rows for name, rows in by_name.items() if rows}
-    for name in asked:
+    for name in requested:
         if name not in offered:
             problem = f"no run covers {name} candidates, only {list(offered)[-1]} ones"
             raise InputError(runs[0].place, "--candidates", problem, f"Choose one of: {', '.join(offered)}")
-    return {name: rows for name, rows in offered.items() if not asked or name in asked}
+    return {name: rows for name, rows in offered.items() if not requested or name in requested}
 
 
 def refuse_seen_houses(
@@ -150,13 +150,13 @@ def refuse_seen_houses(
     evaluated: Iterable[EvaluatedMethod],
     fix: str = "Evaluate a run of another split, or give --allow-seen-houses to report them separately",
 ) -> None:
-    """InputError that names a house of these runs on which a method was trained."""
-    by = [(f"{c.name} ({c.place})", c.houses) for c in evaluated]
+    """Raise InputError that names a house of these runs on which a method was trained."""
+    trained = [(f"{c.name} ({c.place})", c.houses) for c in evaluated]
     for run in runs:
         here = run.stream.house_ids()
-        for who, houses in by:
+        for method, houses in trained:
             if shared := sorted(here & houses):
-                problem = f"{shared[0]!r} and {len(shared) - 1} more: {who} was trained on them"
+                problem = f"{shared[0]!r} and {len(shared) - 1} more: {method} was trained on them"
                 if len(shared) == 1:
-                    problem = f"{shared[0]!r}: {who} was trained on it"
+                    problem = f"{shared[0]!r}: {method} was trained on it"
                 raise InputError(run.place, "house_id", problem, fix)

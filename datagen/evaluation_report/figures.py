@@ -66,7 +66,7 @@ def looks_of(records: Sequence[Report]) -> dict[str, dict[str, Any]]:
     return looks
 
 
-def draw_intervals(report: Report, told: Report) -> Figure:
+def draw_intervals(report: Report, scores: Report) -> Figure:
     """Draw each method as a dot with its interval, by metric; the paper's accuracy as a bar."""
     records = report["methods"]
     figure = new_figure(12, 1.1 + 0.36 * len(records))
@@ -74,7 +74,7 @@ def draw_intervals(report: Report, told: Report) -> Figure:
     panels = figure.subplots(1, len(_SHOWN), sharey=True, squeeze=False)[0]
     for ax, metric in zip(panels, _SHOWN, strict=True):
         for y, record in enumerate(records):
-            estimate = told["methods"][record["name"]][metric]
+            estimate = scores["methods"][record["name"]][metric]
             _draw_estimate(ax, y, estimate, looks[record["name"]])
             stated = paper_accuracy(record, report["paper"])
             if metric == "accuracy" and stated is not None:
@@ -100,7 +100,7 @@ def _draw_estimate(ax: Axes, y: int, estimate: Report, look: dict[str, Any]) -> 
     ax.plot(100 * estimate["value"], y, look["marker"], color=look["color"], mec="white", mew=0.6, ms=8)
 
 
-def draw_curves(report: Report, told: Report) -> Figure:
+def draw_curves(report: Report, scores: Report) -> Figure:
     """Draw ROC, precision-recall and reliability curves of every method side by side."""
     records = report["methods"]
     figure = new_figure(12, 5.6)
@@ -108,23 +108,25 @@ def draw_curves(report: Report, told: Report) -> Figure:
     looks = looks_of(records)
     for k, record in enumerate(records):
         name = record["name"]
-        # Markers stand at other places on each curve, so that no two of them hide each other.
+        # Each curve has its markers at other positions, so that they do not hide each other.
         look = looks[name] | {"ms": 6, "mec": "white", "mew": 0.5}
         spread = look | {"markevery": (0.02 + 0.14 * (k % 8) / 8, 0.14)}
-        curves, methods = told["curves"][name], told["methods"][name]
+        curves, methods = scores["curves"][name], scores["methods"][name]
         area = methods["area_under_roc"]["value"]
         roc.plot(curves["roc"]["x"], curves["roc"]["y"], **spread, label=f"{plain(name)} ({area:.2f})")
         precision = curves["precision_recall"]
         words = f"{plain(name)} ({curves['average_precision']:.2f})"
         pr.step(precision["x"], precision["y"], where="pre", **spread, label=words)
         if methods["reliability"]:
-            said, true = ([bin_[key] for bin_ in methods["reliability"]] for key in ("said", "true"))
+            predicted, observed = ([bin_[key] for bin_ in methods["reliability"]] for key in ("said", "true"))
             sizes = [bin_["count"] for bin_ in methods["reliability"]]
-            reliability.plot(said, true, **look | {"marker": ""})
+            reliability.plot(predicted, observed, **look | {"marker": ""})
             area_pt2 = [14 + 160 * n / max(sizes) for n in sizes]
-            reliability.scatter(said, true, s=area_pt2, color=look["color"], marker=look["marker"], alpha=0.7)
+            reliability.scatter(
+                predicted, observed, s=area_pt2, color=look["color"], marker=look["marker"], alpha=0.7
+            )
             reliability.plot([], [], **look, label=f"{plain(name)} ({methods['brier']:.3f})")
-    share = told["positives"] / told["count"]
+    share = scores["positives"] / scores["count"]
     pr.axhline(share, color="#999999", lw=0.8, ls=":")
     for ax in (roc, reliability):
         ax.plot([0, 1], [0, 1], color="#999999", lw=0.8, ls=":")
@@ -241,7 +243,7 @@ def _draw_scores(ax: Axes, grid: Columns, score: F64) -> None:
     ax.plot(0, 0, "+", color="black", ms=8)
     share = picks(score, np.zeros(len(grid), np.int64), grid.is_clear)
     tied = np.flatnonzero(share)
-    # Of several best scores the first is shown, with their number.
+    # The first of several best scores is shown, with their number.
     pick = tied[0]
     is_good = bool(grid.label[pick])
     colour, marker = (BEST.colour, BEST.marker) if is_good else ("white", "X")
@@ -257,7 +259,7 @@ def _draw_scores(ax: Axes, grid: Columns, score: F64) -> None:
 
 
 def _draw_reach(ax: Axes, grid: Columns) -> None:
-    """Horizontal distance (m) within the arm's reach of the target."""
+    """Draw the horizontal distance (m) within which the arm reaches the target."""
     reach_m, mount_m, planar_m = (float(a[0]) for a in (grid.reach_m, grid.mount_distance_m, grid.distance_m))
     left_m2 = reach_m**2 - max(mount_m**2 - planar_m**2, 0.0)
     if left_m2 > 0:

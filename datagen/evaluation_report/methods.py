@@ -40,8 +40,8 @@ REGIMES = {"stage1": "stage1", "sim-only": "sim-only", "stage2": "two-stage"}
 class EvaluatedMethod:
     """One method and its origin.
 
-    Models have a path and a checkpoint, baselines their fitted numbers, and where they were fitted a
-    calibration. `note` is printed wherever the method is named.
+    Models have a path and a checkpoint. Baselines have a state and, if they are fitted, a calibration. `note`
+    is printed with the method's name.
     """
 
     name: str
@@ -51,7 +51,7 @@ class EvaluatedMethod:
     state: Mapping[str, Any] = field(default_factory=dict)
     note: str = ""
     calibration: Calibration | None = None
-    gives_probabilities: bool = False  # where neither a checkpoint nor `scalars` says so
+    gives_probabilities: bool = False  # of methods other than models and `scalars`
 
     @property
     def regime(self) -> str:
@@ -60,7 +60,7 @@ class EvaluatedMethod:
 
     @property
     def origin(self) -> TrainedBy:
-        """Key of the training, for comparisons of equal ones."""
+        """Key of the training, to compare models that differ in one part of it."""
         if self.head is None:
             return NO_TRAINING
         return TrainedBy(self.regime, self.head.model, house_share(self.head))
@@ -137,7 +137,7 @@ def read_heuristic(path: Path, runs: Sequence[EvaluatedRun], allow_seen_houses: 
 
 
 def baseline_methods(
-    asked: Sequence[str] | None,
+    requested: Sequence[str] | None,
     fit: Sequence[str],
     detector: Path | None,
     heuristic: HeuristicParams | None,
@@ -151,24 +151,24 @@ def baseline_methods(
 
     InputError where a requested one is not available, or where `fit` and `runs` share a house.
     """
-    if asked and NONE in asked:
-        if len(asked) > 1:
+    if requested and NONE in requested:
+        if len(requested) > 1:
             raise InputError("--baselines", NONE, "is given with others", "Give only none, or omit it")
         return BaselineMethods((), {}, frozenset())
-    names = list(dict.fromkeys(asked or BASELINES))
+    names = list(dict.fromkeys(requested or BASELINES))
     left_out: dict[str, str] = {}
-    if not asked and EXTRAS["sim"].missing():
+    if not requested and EXTRAS["sim"].missing():
         names.remove("reachability")
         left_out["reachability"] = f"needs the robots' files. {how_to_get('sim')}"
     specs = [spec for run in runs for spec in run.specs]
-    specs += [run.manifest.spec for place in fit for run in open_runs(place)]
+    specs += [run.manifest.spec for path in fit for run in open_runs(path)]
     robots = tuple(dict.fromkeys(spec.arm.robot for spec in specs if spec.arm is not None))
     made = make_baselines(names, detector, heuristic, seed, robots)
     calibrations: dict[str, Calibration] = {}
     houses: frozenset[str] = frozenset()
     if fit:
-        for place in fit:
-            refuse_no_trials(place)
+        for path in fit:
+            refuse_no_trials(path)
         stream = SampleStream(
             fit,
             scenes_per_batch=SCENES_PER_BATCH,
@@ -190,43 +190,43 @@ def baseline_methods(
         why = "needs runs to fit its parameters on (--fit)"
         unfitted = {name: why for name, b in zip(names, made, strict=True) if b.needs_fit}
         left_out |= unfitted
-        if asked and unfitted:
+        if requested and unfitted:
             name = next(iter(unfitted))
             raise InputError("--baselines", name, why, "Name runs in validation houses with --fit")
         made = [b for b in made if not b.needs_fit]
     # The note of a method follows its name in brackets.
-    told = [(b, *b.name.partition(" (")[::2]) for b in made]
+    named = [(b, *b.name.partition(" (")[::2]) for b in made]
     return BaselineMethods(
         tuple(
             EvaluatedMethod(
                 name, b, state=b.state(), note=note.rstrip(")"), calibration=calibrations.get(b.name)
             )
-            for b, name, note in told
+            for b, name, note in named
         ),
         left_out,
         houses,
     )
 
 
-def open_models(places: Sequence[str]) -> list[EvaluatedMethod]:
-    """The models of these checkpoints, with unique names from their regimes; the released one has its own."""
-    if not places:
+def open_models(paths: Sequence[str]) -> list[EvaluatedMethod]:
+    """The models of these checkpoints, with unique names by regime; the released one has its own."""
+    if not paths:
         return []
     from datagen.train.training.checkpoints import load_model
 
-    loaded = [(place, *load_model(place)) for place in places]
-    ours = str(released_checkpoint())
+    loaded = [(path, *load_model(path)) for path in paths]
+    released = str(released_checkpoint())
     names = _names(
-        [(RELEASED if place == ours else _regime_name(head), head.model) for place, _, head in loaded]
+        [(RELEASED if path == released else _regime_name(head), head.model) for path, _, head in loaded]
     )
     by_digest: dict[str, str] = {}
-    for place, _, head in loaded:
+    for path, _, head in loaded:
         if head.digest in by_digest:
-            raise InputError(place, "", f"is the same checkpoint as {by_digest[head.digest]}", "Name it once")
-        by_digest[head.digest] = place
+            raise InputError(path, "", f"is the same checkpoint as {by_digest[head.digest]}", "Name it once")
+        by_digest[head.digest] = path
     return [
-        EvaluatedMethod(name, ModelScorer(model, name, only_clear=True), place, head)
-        for (place, model, head), name in zip(loaded, names, strict=True)
+        EvaluatedMethod(name, ModelScorer(model, name, only_clear=True), path, head)
+        for (path, model, head), name in zip(loaded, names, strict=True)
     ]
 
 

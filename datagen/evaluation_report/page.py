@@ -1,4 +1,4 @@
-"""An evaluation as one HTML page that needs nothing beside it: tables, curves, and grids of a few scenes."""
+"""An evaluation as one self-contained HTML page: tables, curves, and grids of a few scenes."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def page_of(report: Report, gathered: Gathered) -> str:
 
 def about(report: Report) -> str:
     """The runs and the notes on the numbers."""
-    places = ", ".join(run["place"] for run in report["runs"])
-    return html_facts([("labels", places), *tables.notes(report)])
+    paths = ", ".join(run["place"] for run in report["runs"])
+    return html_facts([("labels", paths), *tables.notes(report)])
 
 
 def tables_of(report: Report, name: str = "", level: int = 2) -> list[str]:
@@ -39,29 +39,29 @@ def tables_of(report: Report, name: str = "", level: int = 2) -> list[str]:
     for number, part in enumerate(report["parts"]):
         if title := tables.part_title(report, part):
             body.append(f"<h{level}>{escape(title)}</h{level}>")
-        for candidates, told in part["sets"].items():
-            body += _set(report, told, f"{name}{number}-{candidates}", level)
+        for candidates, scores in part["sets"].items():
+            body += _set(report, scores, f"{name}{number}-{candidates}", level)
         for candidates, why in part["left_out"].items():
             body.append(f"<h{level}>Table I: {escape(candidates)} left out</h{level}><p>{escape(why)}</p>")
         body += _grids(report, part, level)
     return body
 
 
-def _set(report: Report, told: Report, name: str, level: int) -> list[str]:
-    candidates, below = told["candidates"], level + 1
+def _set(report: Report, scores: Report, name: str, level: int) -> list[str]:
+    candidates, below = scores["candidates"], level + 1
     return [
         *_shown(
-            tables.accuracy_table(report, told),
+            tables.accuracy_table(report, scores),
             level,
-            html_figure(svg_of(draw_intervals(report, told), f"intervals-{name}")),
+            html_figure(svg_of(draw_intervals(report, scores), f"intervals-{name}")),
         ),
-        *_shown(tables.comparison_table(told["comparisons"], candidates), below, kind="text"),
-        *_order(report, told["differences"], tables.TABLE_I, candidates),
-        *_shown(tables.reach_table(report, told), below),
+        *_shown(tables.comparison_table(scores["comparisons"], candidates), below, kind="text"),
+        *_order(report, scores["differences"], tables.TABLE_I, candidates),
+        *_shown(tables.reach_table(report, scores), below),
         f"<h{below}>Curves</h{below}>",
-        html_figure(svg_of(draw_curves(report, told), f"curves-{name}")),
-        *_shown(tables.calibration_table(report, told), below),
-        *(_folded(shown) for shown in tables.breakdown_tables(report, told)),
+        html_figure(svg_of(draw_curves(report, scores), f"curves-{name}")),
+        *_shown(tables.calibration_table(report, scores), below),
+        *(_folded(shown) for shown in tables.breakdown_tables(report, scores)),
     ]
 
 
@@ -105,7 +105,7 @@ def sources_of(report: Report, level: int = 2) -> Iterable[str]:
 
 
 def _shown(shown: TitledTable | None, level: int, first: str = "", kind: str = "") -> list[str]:
-    """Heading, whatever comes first, and the table; nothing where it has no rows."""
+    """Heading, the HTML `first`, and the table; nothing where it has no rows."""
     if shown is None or not shown.rows:
         return []
     return [f"<h{level}>{escape(shown.title)}</h{level}>", first, html_table(shown.heads, shown.rows, kind)]

@@ -32,9 +32,9 @@ def evaluation_report(
     seed: int,
     arrival: Arrival | None = None,
 ) -> dict[str, Any]:
-    """All tables and curves. Scenes in houses that a method was trained on are a part of their own.
+    """All tables and curves. Scenes in houses that a method was trained on are a separate part.
 
-    `sets` names candidates, each with the indices of the runs that offer them.
+    `sets` has candidate sets by name, each with the indices of the runs that offer it.
     """
     columns, evaluated = gathered.columns, [*baselines.baselines, *models]
     seen_houses = baselines.houses.union(*(model.houses for model in models))
@@ -83,14 +83,14 @@ def _part(
     is_one_of_two: bool,
     arrival: Arrival | None,
 ) -> dict[str, Any]:
-    """The tables of some scenes. A set with too few scenes on one side is omitted."""
-    told: dict[str, Any] = {}
+    """The tables of one part. A set with too few scenes in one of two parts is omitted."""
+    scored: dict[str, Any] = {}
     left_out: dict[str, str] = {}
     for name, runs in sets.items():
-        drawn_whole = columns.of_scenes(np.isin(columns.run, runs))
-        weights = weights_for(drawn_whole, resamples, seed)
+        covered = columns.of_scenes(np.isin(columns.run, runs))
+        weights = weights_for(covered, resamples, seed)
         try:
-            told[name] = {**evaluate_set(drawn_whole, methods, name, weights, objects), "runs": list(runs)}
+            scored[name] = {**evaluate_set(covered, methods, name, weights, objects), "runs": list(runs)}
         except InputError as error:
             if not is_one_of_two:
                 raise
@@ -109,7 +109,7 @@ def _part(
         "scenes": columns.n_scenes,
         "house_count": len(set(columns.house.tolist())),
         "candidates": len(columns),
-        "sets": told,
+        "sets": scored,
         "left_out": left_out,
         "grids": grids,
         "no_grids": why,

@@ -42,27 +42,27 @@ class TitledTable:
     rows: Sequence[Sequence[str]]
 
 
-def accuracy_table(report: Report, told: Report, metrics: Sequence[str] = TABLE_I) -> TitledTable:
+def accuracy_table(report: Report, scores: Report, metrics: Sequence[str] = TABLE_I) -> TitledTable:
     """Return Table I: these metrics of every method, with the paper's accuracy."""
     rows = [
         (
             method_label(record),
-            *(with_interval(told["methods"][record["name"]][metric]) for metric in metrics),
+            *(with_interval(scores["methods"][record["name"]][metric]) for metric in metrics),
             percent(paper_accuracy(record, report["paper"])),
         )
         for record in report["methods"]
     ]
     heads = ("method", *(f"{METRIC_WORDS[metric]} (%)" for metric in metrics), "accuracy in the paper (%)")
-    return TitledTable(f"Table I: {candidates_line(told)}", heads, rows)
+    return TitledTable(f"Table I: {candidates_line(scores)}", heads, rows)
 
 
-def choice_table(report: Report, told: Report) -> TitledTable:
+def choice_table(report: Report, scores: Report) -> TitledTable:
     """Return the table of choices among a robot's candidates of a set, and of their order."""
     rows = [
-        (record["name"], *(with_interval(told["methods"][record["name"]][metric]) for metric in CHOICE))
+        (record["name"], *(with_interval(scores["methods"][record["name"]][metric]) for metric in CHOICE))
         for record in report["methods"]
     ]
-    title = f"choosing among a robot's candidates ({told['candidates']})"
+    title = f"choosing among a robot's candidates ({scores['candidates']})"
     return TitledTable(title, ("method", *(f"{METRIC_WORDS[metric]} (%)" for metric in CHOICE)), rows)
 
 
@@ -85,32 +85,32 @@ def order_tables(
     """Return which methods each method is above and below, by metric; empty for one method."""
     for metric in metrics:
         rows = [
-            (record["name"], *("; ".join(names) or "-" for names in said.values()))
+            (record["name"], *("; ".join(names) or "-" for names in others.values()))
             for record in records
-            if any((said := compared(differences, metric, record["name"])).values())
+            if any((others := compared(differences, metric, record["name"])).values())
         ]
         if rows:
             title = f"by {METRIC_WORDS[metric]} ({where}): + where the two intervals are disjoint as well"
             yield TitledTable(title, ("method", "above", "not significant", "below"), rows)
 
 
-def reach_table(report: Report, told: Report) -> TitledTable | None:
+def reach_table(report: Report, scores: Report) -> TitledTable | None:
     """Return Table II: accuracy within and beyond reach; None where no candidate is beyond."""
-    inside, outside = told["in_reach"], told["out_of_reach"]
+    inside, outside = scores["in_reach"], scores["out_of_reach"]
     if not outside["count"]:
         return None
     rows = [
         (
             method_label(record),
-            with_interval(told["methods"][record["name"]]["accuracy_in_reach"]),
-            with_interval(told["methods"][record["name"]]["accuracy_out_of_reach"]),
+            with_interval(scores["methods"][record["name"]]["accuracy_in_reach"]),
+            with_interval(scores["methods"][record["name"]]["accuracy_out_of_reach"]),
             percent(paper_accuracy(record, report["paper"])) if record["regime"] else "-",
             percent(report["paper"]["accuracy_out_of_reach"]) if record["regime"] == "two-stage" else "-",
         )
         for record in models_first(report["methods"])
     ]
     title = (
-        f"Table II: {told['candidates']}, {inside['count']:,} within reach and {outside['count']:,} beyond"
+        f"Table II: {scores['candidates']}, {inside['count']:,} within reach and {outside['count']:,} beyond"
     )
     return TitledTable(
         title, ("method", "within reach (%)", "beyond (%)", "paper, all (%)", "paper, beyond (%)"), rows
@@ -122,9 +122,9 @@ def grids_table(report: Report, grids: Report) -> TitledTable:
     rows = [
         (
             record["name"],
-            with_interval((told := grids["methods"][record["name"]])["good"]),
-            metres_with_interval(told["missed_m"]),
-            with_interval(told["mean_average_precision"]),
+            with_interval((scores := grids["methods"][record["name"]])["good"]),
+            metres_with_interval(scores["missed_m"]),
+            with_interval(scores["mean_average_precision"]),
             f"{record['seconds_per_600']:.2g}",
         )
         for record in models_first(report["methods"])
@@ -141,7 +141,7 @@ def grids_table(report: Report, grids: Report) -> TitledTable:
 
 
 def arrival_table(report: Report, grids: Report) -> TitledTable | None:
-    """Return the success of picks where the robot arrives off them; None without whole square grids."""
+    """Return the success of picks when the robot parks with an error; None without whole square grids."""
     if not (found := grids["arrivals"]):
         return None
 
@@ -159,21 +159,23 @@ def arrival_table(report: Report, grids: Report) -> TitledTable | None:
     return TitledTable(title, ("method", "pick", *(row["arrival"] for row in found)), rows)
 
 
-def calibration_table(report: Report, told: Report) -> TitledTable:
+def calibration_table(report: Report, scores: Report) -> TitledTable:
     """Return the table of calibration errors; without rows where no method predicts probabilities."""
     rows = [
-        (record["name"], f"{said['brier']:.4f}", f"{said['expected_calibration_error']:.4f}")
+        (record["name"], f"{values['brier']:.4f}", f"{values['expected_calibration_error']:.4f}")
         for record in report["methods"]
-        if (said := told["methods"][record["name"]])["brier"] is not None
+        if (values := scores["methods"][record["name"]])["brier"] is not None
     ]
     heads = ("method", "Brier score", "calibration error (ECE)")
-    return TitledTable(f"probabilities ({told['candidates']})", heads, rows)
+    return TitledTable(f"probabilities ({scores['candidates']})", heads, rows)
 
 
-def breakdown_tables(report: Report, told: Report, most_methods: int | None = None) -> Iterator[TitledTable]:
-    """Return tables of accuracy by groups of candidates, for some methods."""
+def breakdown_tables(
+    report: Report, scores: Report, most_methods: int | None = None
+) -> Iterator[TitledTable]:
+    """Return tables of accuracy by groups of candidates, for at most `most_methods` methods."""
     names = [record["name"] for record in models_first(report["methods"])][:most_methods]
-    for heading in dict.fromkeys(row["by"] for row in told["breakdown"]):
+    for heading in dict.fromkeys(row["by"] for row in scores["breakdown"]):
         rows = [
             (
                 row["group"],
@@ -181,10 +183,10 @@ def breakdown_tables(report: Report, told: Report, most_methods: int | None = No
                 percent(row["positives"] / row["count"]),
                 *(percent(row["methods"][name]["accuracy"]) for name in names),
             )
-            for row in told["breakdown"]
+            for row in scores["breakdown"]
             if row["by"] == heading
         ]
-        title = f"accuracy by {heading} ({told['candidates']}), in %"
+        title = f"accuracy by {heading} ({scores['candidates']}), in %"
         yield TitledTable(title, (heading, "count", "good (%)", *names), rows)
 
 
@@ -250,23 +252,23 @@ def models_first(records: Sequence[Report]) -> list[Report]:
 
 
 def compared(differences: Sequence[Report], metric: str, name: str) -> dict[str, list[str]]:
-    """Methods that one is `above`, `below` and `open` to by a metric; + where intervals are disjoint."""
+    """Other methods by the verdict on a metric: `above`, `open`, `below`; + where intervals are disjoint."""
     found: dict[str, list[str]] = {"above": [], "open": [], "below": []}
     other_way = {"above": "below", "below": "above", "open": "open"}
     for d in differences:
         if d["metric"] != metric or name not in (d["first"], d["second"]):
             continue
         is_first = d["first"] == name
-        said = d["verdict"] if is_first else other_way[d["verdict"]]
-        found[said].append((d["second"] if is_first else d["first"]) + ("+" if d["disjoint"] else ""))
+        verdict = d["verdict"] if is_first else other_way[d["verdict"]]
+        found[verdict].append((d["second"] if is_first else d["first"]) + ("+" if d["disjoint"] else ""))
     return found
 
 
-def candidates_line(told: Report) -> str:
+def candidates_line(scores: Report) -> str:
     """Size of a set: 1,200 candidates of 80 scenes (clear), 31.0% positive."""
-    share = percent(told["positives"] / told["count"])
-    words = SET_WORDS[told["candidates"]]
-    return f"{told['count']:,} candidates of {told['scenes']:,} scenes ({words}), {share}% positive"
+    share = percent(scores["positives"] / scores["count"])
+    words = SET_WORDS[scores["candidates"]]
+    return f"{scores['count']:,} candidates of {scores['scenes']:,} scenes ({words}), {share}% positive"
 
 
 def grids_line(grids: Report) -> str:
@@ -279,20 +281,20 @@ def grids_line(grids: Report) -> str:
 
 
 def print_evaluation(report: Report) -> None:
-    """Tables I to III with the paper's numbers, differences, calibration and breakdowns."""
+    """Print Tables I to III with the paper's numbers, differences, calibration and breakdowns."""
     models = [r for r in report["methods"] if r["regime"]] or report["methods"]
     for part in report["parts"]:
         if title := part_title(report, part):
             print_rows(title, [])
-        for name, told in part["sets"].items():
-            _print(accuracy_table(report, told, DECISIONS))
-            _print(comparison_table(told["comparisons"], name))
-            for shown in order_tables(models, told["differences"], DECISIONS[:2], name):
+        for name, scores in part["sets"].items():
+            _print(accuracy_table(report, scores, DECISIONS))
+            _print(comparison_table(scores["comparisons"], name))
+            for shown in order_tables(models, scores["differences"], DECISIONS[:2], name):
                 _print(shown)
         for name, why in part["left_out"].items():
             print_rows(f"Table I: {name} is omitted", [("", why)])
-        for told in part["sets"].values():
-            _print(reach_table(report, told))
+        for scores in part["sets"].values():
+            _print(reach_table(report, scores))
         if (grids := part["grids"]) is None:
             print_rows("Table III: omitted", [("", part["no_grids"])])
         else:
@@ -301,12 +303,12 @@ def print_evaluation(report: Report) -> None:
             _print(comparison_table(grids["comparisons"], "whole grids"))
             for shown in order_tables(models, grids["differences"], TABLE_III, "whole grids"):
                 _print(shown)
-        for told in part["sets"].values():
-            _print(calibration_table(report, told))
+        for scores in part["sets"].values():
+            _print(calibration_table(report, scores))
         # Methods differ most on the narrowest set.
-        for told in list(part["sets"].values())[:1]:
-            _print(choice_table(report, told))
-            for shown in breakdown_tables(report, told, _MOST_COLUMNS):
+        for scores in list(part["sets"].values())[:1]:
+            _print(choice_table(report, scores))
+            for shown in breakdown_tables(report, scores, _MOST_COLUMNS):
                 _print(shown)
     print_rows("notes", notes(report))
 

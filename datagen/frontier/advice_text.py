@@ -10,7 +10,7 @@ from datagen.train.evaluation.bootstrap import Estimate
 
 
 def advice_text(advice: Advice, cpu_h: float) -> str:
-    """What the next core-hours are best spent on, and how sure that is."""
+    """The best use of the next core-hours and its certainty, as a sentence."""
     best = advice.best
     bought = advice.alone[best]
     gained = Estimate(bought.accuracy - advice.now, bought.resamples - advice.now_resamples)
@@ -32,7 +32,7 @@ def advice_text(advice: Advice, cpu_h: float) -> str:
 
 
 def target_text(target: Target, curve: LearningCurve) -> str:
-    """What reaches the wanted accuracy."""
+    """The labels that reach the target accuracy, as a sentence."""
     if target.reached_by_half is None:
         most = float(np.median(1 - curve.resamples[:, 0]))
         return (

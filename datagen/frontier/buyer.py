@@ -1,4 +1,4 @@
-"""What to buy next: label sources compared by the accuracy that a curve of all of them predicts.
+"""The labels to buy next: sources compared by the accuracy that a joint learning curve predicts.
 
 As in Learn-Optimize-Collect (Mahmood et al. 2022, arXiv 2210.01234), the curve's uncertainty is a bootstrap
 of its fit, and a purchase is judged over all resamples.
@@ -48,7 +48,7 @@ class Advice:
 
     @property
     def best(self) -> str:
-        """The source that wins most often; the higher predicted accuracy decides between equals."""
+        """The source that wins most often; ties go to the higher predicted accuracy."""
         return max(self.alone, key=lambda name: (self.wins[name], self.alone[name].accuracy))
 
 
@@ -56,7 +56,7 @@ class Advice:
 class Target:
     """Core-hours that reach an accuracy in half and in nine tenths of the resamples, with their labels.
 
-    None where 10,000 core-hours do not.
+    None where 10,000 core-hours are not enough.
     """
 
     accuracy: float
@@ -67,7 +67,7 @@ class Target:
 def advise(
     curve: LearningCurve, sources: Sequence[str], now: F64, costs: Mapping[str, LabelCost], cpu_h: float
 ) -> Advice:
-    """Compare spending `cpu_h` core-hours of labels on each source, from labels `now` (K,) on."""
+    """Compare spending `cpu_h` core-hours of labels on each source, in addition to labels `now` (K,)."""
     before, before_all = _with_or_without_cheap(curve, now)
     alone = {
         name: _purchase(curve, sources, now, costs, cpu_h, np.eye(len(sources))[k])

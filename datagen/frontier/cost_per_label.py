@@ -14,7 +14,7 @@ from datagen.schemas.merged_runs import open_runs
 
 @dataclass(frozen=True)
 class LabelCost:
-    """Core seconds and money of one label from nothing on: waste, scenes and storage included."""
+    """Core seconds and money of one label; waste, scenes and storage are included."""
 
     cpu_s: float
     money: float
@@ -26,8 +26,8 @@ def label_costs(runs: Mapping[str, Sequence[str]], prices: Prices) -> dict[str, 
     InputError for runs whose records have no time, and where the scenes of --scenes-from were made by a run
     that is not among these.
     """
-    named = [(source, place) for source, places in runs.items() for place in places]
-    opened = [(source, run) for source, place in named for run in open_runs(place)]
+    named = [(source, path) for source, paths in runs.items() for path in paths]
+    opened = [(source, run) for source, path in named for run in open_runs(path)]
     spendings = [account_for([run]) for _, run in opened]
     costs = costs_of_runs([run for _, run in opened], spendings)
     labels, core_s, money = (dict.fromkeys(runs, 0.0) for _ in range(3))
@@ -38,8 +38,8 @@ def label_costs(runs: Mapping[str, Sequence[str]], prices: Prices) -> dict[str, 
         labels[source] += spending.labels
         core_s[source] += cost.total.core_s
         money[source] += cost.total.money(prices)
-    for source, places in runs.items():
+    for source, paths in runs.items():
         if not labels[source] or not core_s[source]:
             fix = "Name a run with its ledger, not a sealed store or a copy without records"
-            raise InputError(", ".join(places), "cost", "no CPU second is recorded", fix)
+            raise InputError(", ".join(paths), "cost", "no CPU second is recorded", fix)
     return {name: LabelCost(core_s[name] / labels[name], money[name] / labels[name]) for name in runs}

@@ -9,7 +9,7 @@ from datagen.console.printing import print_lines, print_rows, seconds
 from datagen.frontier.advice_text import advice_text, target_text
 from datagen.frontier.buyer import Purchase
 from datagen.frontier.points import METRICS, efficient
-from datagen.frontier.study import JUDGED, Study, gain_record, said
+from datagen.frontier.study import JUDGED, Study, estimate_record, gain_record
 from datagen.reports.prices import Prices
 from datagen.train.evaluation.bootstrap import Estimate
 
@@ -18,7 +18,7 @@ Record = dict[str, Any]
 
 def frontier_record(study: Study, prices: Prices, budget_cpu_h: float, data: Mapping[str, Any]) -> Record:
     """All numbers as plain values. `data`: the runs and the test set."""
-    on_it = {metric: efficient(study.points, metric) for metric in METRICS}
+    on_frontier = {metric: efficient(study.points, metric) for metric in METRICS}
     advice, curve = study.advice, study.joint.get(JUDGED)
     sentences = [advice_text(advice, budget_cpu_h)] if advice else []
     if study.target and curve:
@@ -37,19 +37,23 @@ def frontier_record(study: Study, prices: Prices, budget_cpu_h: float, data: Map
                 "label_cpu_h": point.cpu_h,
                 "money": point.money,
                 "train_cpu_s": point.train_cpu_s,
-                **{metric: said(point.values[metric]) for metric in METRICS},
-                "on_frontier": {metric: on_it[metric][k] for metric in METRICS},
+                **{metric: estimate_record(point.values[metric]) for metric in METRICS},
+                "on_frontier": {metric: on_frontier[metric][k] for metric in METRICS},
             }
             for k, point in enumerate(study.points)
         ],
         "stage1": [gain_record(gain) for gain in study.stage1],
-        "stage1_worth": study.stage1_worth and said(study.stage1_worth),
+        "stage1_worth": study.stage1_worth and estimate_record(study.stage1_worth),
         "curves": {
             metric: {"parameters": curve.theta.tolist(), "residual": curve.residual}
             for metric, curve in study.joint.items()
         },
         "foretold": [
-            {"trained_on": f.name, "measured": said(f.measured), "predicted": said(f.predicted)}
+            {
+                "trained_on": f.name,
+                "measured": estimate_record(f.measured),
+                "predicted": estimate_record(f.predicted),
+            }
             for f in study.foretold
         ],
         "advice": advice
@@ -57,7 +61,7 @@ def frontier_record(study: Study, prices: Prices, budget_cpu_h: float, data: Map
             "budget_cpu_h": budget_cpu_h,
             "best": advice.best,
             "wins": dict(advice.wins),
-            "now": said(Estimate(advice.now, advice.now_resamples)),
+            "now": estimate_record(Estimate(advice.now, advice.now_resamples)),
             "alone": {name: _purchase(purchase) for name, purchase in advice.alone.items()},
             "best_split": _purchase(advice.split),
         },
@@ -72,7 +76,7 @@ def frontier_record(study: Study, prices: Prices, budget_cpu_h: float, data: Map
 
 
 def _purchase(purchase: Purchase) -> Record:
-    expected = said(Estimate(purchase.accuracy, purchase.resamples))
+    expected = estimate_record(Estimate(purchase.accuracy, purchase.resamples))
     return {"labels": dict(purchase.labels), "cpu_h": purchase.cpu_h, "balanced_accuracy": expected}
 
 
@@ -107,7 +111,7 @@ def print_frontier(record: Record, files: Sequence[tuple[str, str]]) -> None:
         ("before", "over the same labels alone", "over the same cost alone"),
     )
     print_rows(
-        "what a curve of the smaller sets said of the largest (balanced accuracy)",
+        "largest sets, predicted by a curve of the smaller ones (balanced accuracy)",
         [
             (f["trained_on"], percent_text(f["predicted"]), percent_text(f["measured"]))
             for f in record["foretold"]

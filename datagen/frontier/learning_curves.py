@@ -4,14 +4,14 @@ One source alone follows a power law with an offset (Mahmood et al. 2022, arXiv 
 
     error(n) = e + a (n / n0)^-b
 
-Of several sources, labels are converted into labels of the first dear source, which add up, as effective
-data of a transfer do (Hernandez et al. 2021, arXiv 2102.01293, eq. 1.2):
+For several sources, labels are converted into labels of the first dear source and added, like the effective
+data of a transfer (Hernandez et al. 2021, arXiv 2102.01293, eq. 1.2):
 
     m = q_1 + w q_2 + k n0 (q_cheap / h0)^g        error = e + a (m / n0)^-b
 
-n0 and h0 are the largest numbers of labels measured. Parameters are those of least squares, with weak priors:
-a curve without bend says nothing about b, and one without a second dear source nothing about w. Each resample
-of the bootstrap has a fit of its own.
+n0 and h0 are the largest numbers of labels measured. Parameters are fitted by least squares with weak priors:
+a curve without a bend does not determine b, and one without a second dear source does not determine w. Each
+resample of the bootstrap is fitted separately.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from scipy.optimize import least_squares
 
 from datagen.train.inputs import F64
 
-# An error of a point by this much costs as much as a parameter that is off by its prior's standard deviation;
-# points differ by about as much between seeds.
+# The residual of a point that weighs as much as one standard deviation of a prior. Points differ by about as
+# much between seeds.
 _SPREAD = 0.005
 # log b, log w, g: mean and standard deviation. Exponents of published curves are between 0.1 and 1.
 _PRIOR_LOG_B, _PRIOR_LOG_W, _PRIOR_G = (np.log(0.35), 1.0), (0.0, 1.0), (0.5, 0.25)
@@ -34,7 +34,7 @@ _LEAST_POINTS = 3
 
 @dataclass(frozen=True)
 class CurveForm:
-    """Which terms a curve has: K - 1 or K dear sources, after a cheap one or not, and its units."""
+    """Terms and units of a curve: K - 1 dear sources after a cheap one, or K dear sources."""
 
     dear: int
     cheap: bool
@@ -47,7 +47,7 @@ class CurveForm:
         return 3 + (self.dear - 1) + 2 * self.cheap
 
     def effective(self, theta: F64, labels: F64) -> F64:
-        """Labels m (...) of the first dear source, of labels (..., K), the cheap source first if any.
+        """Equivalent labels m (...) of the first dear source for labels (..., K), cheap source first if any.
 
         `theta` (..., P) broadcasts against the leading dimensions.
         """
@@ -62,7 +62,7 @@ class CurveForm:
         return found
 
     def error(self, theta: F64, labels: F64) -> F64:
-        """Predicted error (...) of labels (..., K)."""
+        """Predicted error (...) with labels (..., K)."""
         m = np.maximum(self.effective(theta, labels), 1.0) / self.unit
         return theta[..., 0] + theta[..., 1] * m ** -np.exp(theta[..., 2])
 
@@ -74,10 +74,10 @@ class LearningCurve:
     form: CurveForm
     theta: F64
     resamples: F64
-    residual: float  # root mean square of the points
+    residual: float  # root mean square over the points
 
     def accuracy(self, labels: F64) -> tuple[F64, F64]:
-        """1 - error (...) of labels (..., K), and (B, ...) of the resamples."""
+        """1 - error (...) with labels (..., K), and (B, ...) of the resamples."""
         drawn = self.resamples.reshape(len(self.resamples), *[1] * (labels.ndim - 1), -1)
         return 1 - self.form.error(self.theta, labels), 1 - self.form.error(drawn, labels)
 
@@ -89,9 +89,9 @@ def fit_curve(form: CurveForm, labels: F64, accuracy: F64, resampled: F64) -> Le
     starts = [_start(form, b) for b in (0.15, 0.5, 1.0)]
     fits = [_fit(form, labels, 1 - accuracy, start) for start in starts]
     theta = min(fits, key=lambda fit: fit[1])[0]
-    of_resamples = [_fit(form, labels, 1 - row, theta)[0] for row in resampled]
+    resampled_theta = [_fit(form, labels, 1 - row, theta)[0] for row in resampled]
     residual = float(np.sqrt(np.mean((form.error(theta, labels) - (1 - accuracy)) ** 2)))
-    return LearningCurve(form, theta, np.array(of_resamples), residual)
+    return LearningCurve(form, theta, np.array(resampled_theta), residual)
 
 
 def _start(form: CurveForm, b: float) -> F64:
@@ -99,7 +99,7 @@ def _start(form: CurveForm, b: float) -> F64:
 
 
 def _bounds(form: CurveForm, labels: F64) -> tuple[F64, F64]:
-    """Of the parameters. Cheap labels may cost some of the fewest dear ones: a bad start takes undoing."""
+    """Bounds (P,) of the parameters. Cheap labels may count negatively: training must undo a bad start."""
     least = labels[:, 1:].sum(axis=1)[labels[:, 0] > 0].min(initial=form.unit) if form.cheap else 0.0
     worst = -0.9 * least / form.unit
     low = [0.0, 0.0, np.log(0.02), *[np.log(0.01)] * (form.dear - 1), *[worst, 0.05] * form.cheap]

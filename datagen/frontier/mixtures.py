@@ -1,4 +1,4 @@
-"""Which models a frontier trains: label sources one after the other, each on a share of its houses."""
+"""The models that a frontier trains: label sources one after the other, each on a share of its houses."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def mixtures_of(sources: Sequence[str], shares: Sequence[float]) -> list[Mixture
 
 
 def options_of(mixture: Mixture, n_labels: int, seed: int, batch_scenes: int) -> Options:
-    """How `datagen train` would train the last stage, with epochs by the number of labels."""
+    """Options of `datagen train` for the last stage, with epochs by the number of labels."""
     if mixture.stages[-1].source == CHEAP:
         name = "stage1"
     else:

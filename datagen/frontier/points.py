@@ -28,7 +28,7 @@ _THRESHOLD = 0.5
 class TestSet:
     """The test candidates within reach: truth (T,) and scene (T,), numbered without gaps."""
 
-    __test__ = False  # no class of tests
+    __test__ = False  # not a test class
     label: Bools
     scene: I64
 
@@ -40,7 +40,7 @@ class TestSet:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A mixture, averaged over seeds. Resamples (B,) of all points are of the same scenes."""
+    """A mixture, averaged over seeds. Resamples (B,) of all points use the same scenes."""
 
     mixture: Mixture
     seeds: int
@@ -107,7 +107,7 @@ def measured(metric: str, test: TestSet, scores: F32, weights: Weights) -> Estim
 def mean_over_seeds(found: Sequence[Estimate], drawn: I64) -> Estimate:
     """The mean of n seeds; `drawn` (B, n) are the seeds of each resample.
 
-    Resampled means of n seeds vary by a factor sqrt((n - 1) / n) too little, which is put right. One seed has
+    Resampled means of n seeds vary by a factor sqrt((n - 1) / n) too little, which is corrected. One seed has
     no variance.
     """
     n = len(found)

@@ -1,4 +1,4 @@
-"""What follows from the points of a frontier: curves, what stage 1 is worth, and what to buy."""
+"""Results from the points of a frontier: learning curves, the worth of stage 1, and purchases."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ JUDGED = METRICS[0]
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Points, and what follows from them. `joint`: curves of all sources together, by metric."""
+    """Points, and results from them. `joint`: curves of all sources together, by metric."""
 
-    sources: tuple[str, ...]  # the cheap one first, if it is there
+    sources: tuple[str, ...]  # the cheap one first, if any
     points: tuple[Point, ...]
     costs: Mapping[str, LabelCost]
     alone: Mapping[tuple[str, str], LearningCurve]  # by source and metric
@@ -43,7 +43,7 @@ class Study:
 
 @dataclass(frozen=True, eq=False)
 class Foretold:
-    """A point with all labels of its last source, and what the curve of the smaller ones said of it."""
+    """A point with all labels of its last source, measured and predicted by the curve of the smaller ones."""
 
     name: str
     measured: Estimate
@@ -119,7 +119,7 @@ def _fitted(sources: Sequence[str], points: Sequence[Point], metric: str) -> Lea
 
 
 def _foretold(sources: Sequence[str], dear: Sequence[Point]) -> tuple[Foretold, ...]:
-    """How well a curve of the smaller sets predicts the largest ones."""
+    """The largest sets, predicted by a curve of the smaller ones."""
     whole = max((point.mixture.stages[-1].share for point in dear), default=0.0)
     smaller = [point for point in dear if point.mixture.stages[-1].share < whole]
     curve = _fitted(sources, smaller, JUDGED)
@@ -154,8 +154,8 @@ def _stage1_gains(
             value, resamples = curve.accuracy(both)
             # The measured point, moved along its curve.
             moved = Estimate(float(value[1] - value[0]), resamples[:, 1] - resamples[:, 0])
-            there = plain.values[JUDGED]
-            equal = Estimate(there.value + moved.value, there.resamples + moved.resamples)
+            measured = plain.values[JUDGED]
+            equal = Estimate(measured.value + moved.value, measured.resamples + moved.resamples)
             same_cost = gained.minus(equal)
         found.append(
             StageOneGain(source, plain.labels[source], gained.minus(plain.values[JUDGED]), same_cost)
@@ -175,7 +175,7 @@ def _stage1_worth(curve: LearningCurve, now: F64) -> Estimate | None:
     )
 
 
-def said(estimate: Estimate) -> dict[str, float | None]:
+def estimate_record(estimate: Estimate) -> dict[str, float | None]:
     """A value with its interval, for JSON."""
     low, high = estimate.interval()
     numbers = {"value": estimate.value, "low": low, "high": high}
@@ -187,6 +187,7 @@ def gain_record(gain: StageOneGain) -> dict[str, Any]:
     return {
         "source": gain.source,
         "labels": gain.labels,
-        "same_labels": {**said(gain.same_labels), "verdict": verdict(gain.same_labels)},
-        "same_cost": gain.same_cost and {**said(gain.same_cost), "verdict": verdict(gain.same_cost)},
+        "same_labels": {**estimate_record(gain.same_labels), "verdict": verdict(gain.same_labels)},
+        "same_cost": gain.same_cost
+        and {**estimate_record(gain.same_cost), "verdict": verdict(gain.same_cost)},
     }

@@ -1,7 +1,7 @@
-"""The trainings of a frontier: each a file named by all that decides it, made in processes of one thread.
+"""The trainings of a frontier: each is a file named by the digest of its inputs, made on one thread.
 
 A file `<key>.npz` has the weights of the best epoch, the scores of the test candidates within reach, and a
-record in JSON. One thread, so that the same training gives the same bits for any number of processes.
+record in JSON. A training has one thread: it gives the same bits for any number of processes.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class TrainingTask:
 
     @property
     def key(self) -> str:
-        """Digest of all that decides the result."""
+        """Digest of the inputs and options."""
         stages = [
             [stage.source, Path(self.encodings[stage.source]).name, stage.share]
             for stage in self.mixture.stages
@@ -61,7 +61,7 @@ class TrainingTask:
 
     @property
     def path(self) -> Path:
-        """Where the result lies."""
+        """File of the result."""
         return Path(self.out, "trainings", f"{self.key}.npz")
 
     @property
@@ -73,7 +73,7 @@ class TrainingTask:
 
 @dataclass(frozen=True, eq=False)
 class TrainingResult:
-    """What a training came to."""
+    """The result of a training."""
 
     labels: Mapping[str, int]  # labels of each source behind the model, those of held-out houses too
     scores: F32  # (T,) of the test candidates within reach
@@ -86,7 +86,7 @@ def make_trainings(
     stopping: Callable[[], bool],
     seen: Callable[[int, int], None],
 ) -> bool:
-    """Make the results that are missing; whether all are there, else it was stopped.
+    """Make the missing results; return whether all exist, else it was stopped.
 
     A task begins when the one that it begins from is done; large ones go first. `seen(done, of)`.
     """
@@ -133,14 +133,14 @@ def _with_those_before(tasks: Sequence[TrainingTask]) -> list[TrainingTask]:
 
 
 def _size(item: tuple[str, TrainingTask]) -> tuple[int, float]:
-    """First those that others begin from, then the largest."""
+    """Sort key: first tasks that others begin from, then the largest."""
     stages = item[1].mixture.stages
     return len(stages), -stages[-1].share
 
 
 @contextmanager
 def _one_thread() -> Generator[None]:
-    """Let children compute on one thread: their libraries read it when they are loaded."""
+    """Limit child processes to one thread by variables that their libraries read when they load."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:
@@ -156,7 +156,7 @@ _stop: Event | None = None
 
 
 def _begin(stop: Event) -> None:
-    """Set up a process: Ctrl-C reaches the whole group, and only the first process decides what it means."""
+    """Set up a child process. It ignores Ctrl-C, which reaches the whole group; the parent handles it."""
     global _stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -182,7 +182,7 @@ def _make(task: TrainingTask) -> bool:
     n_labels = EncodedBatches(data, scenes, _BATCH_SCENES).n_samples
     options = options_of(task.mixture, n_labels, task.seed, _BATCH_SCENES)
     judged = np.arange(len(judge.houses))
-    if last.source == CHEAP:  # as `datagen train stage1` without --val: no dear label decides an epoch
+    if last.source == CHEAP:  # as `datagen train stage1` without --val: no dear label chooses the epoch
         judge = data
         scenes, judged = hold_out(data, scenes, task.seed)
     train = EncodedBatches(data, scenes, _BATCH_SCENES, task.seed)

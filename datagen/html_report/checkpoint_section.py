@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def read_head(path: Path) -> CheckpointHead:
-    """The metadata of a checkpoint. InputError for a file that is none."""
+    """The metadata of a checkpoint. InputError for other files."""
     # Imported here: torch takes seconds to load, and a report of runs does not need it.
     from datagen.train.training.checkpoints import read_checkpoint
 

@@ -1,4 +1,4 @@
-"""Documents of `datagen evaluate --json`, checked for all that tables and figures read."""
+"""Documents of `datagen evaluate --json`, checked for every field that tables and figures read."""
 
 from __future__ import annotations
 
@@ -208,18 +208,18 @@ def read_evaluation(path: Path) -> dict[str, Any]:
         raise InputError(path, "", f"is not JSON ({error})", _FIX) from None
     names = {record["name"] for record in report["methods"]}
     for k, part in enumerate(report["parts"]):
-        for name, told in part["sets"].items():
+        for name, scores in part["sets"].items():
             where = f"parts.{k}.sets.{name}"
-            _refuse_other_methods(path, f"{where}.methods", names, told["methods"])
-            _refuse_other_methods(path, f"{where}.curves", names, told["curves"])
-            for method, numbers in told["methods"].items():
+            _refuse_other_methods(path, f"{where}.methods", names, scores["methods"])
+            _refuse_other_methods(path, f"{where}.curves", names, scores["curves"])
+            for method, numbers in scores["methods"].items():
                 known = [numbers["brier"] is None, numbers["expected_calibration_error"] is None]
                 if len({*known, not numbers["reliability"]}) > 1:
                     problem = "is stated without the others of its kind"
                     raise InputError(path, f"{where}.methods.{method:.80}.reliability", problem, _FIX)
-            for row, group in enumerate(told["breakdown"]):
+            for row, group in enumerate(scores["breakdown"]):
                 _refuse_other_methods(path, f"{where}.breakdown.{row}.methods", names, group["methods"])
-            for method, curves in told["curves"].items():
+            for method, curves in scores["curves"].items():
                 for kind in ("roc", "precision_recall"):
                     if len(curves[kind]["x"]) != len(curves[kind]["y"]):
                         raise InputError(path, f"{where}.curves.{method}.{kind}", "has unequal lengths", _FIX)

@@ -1,4 +1,4 @@
-"""The quantities by which shards and scenes are compared: what is odd in one of them is worth a look."""
+"""The quantities by which shards and scenes are compared to find outliers."""
 
 from __future__ import annotations
 

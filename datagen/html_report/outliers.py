@@ -90,7 +90,7 @@ def outliers_of(measures: Sequence[Measure]) -> list[Outlier]:
 
 
 def most_unusual(measures: Sequence[Measure], count: int, most_each: int) -> list[tuple[int, Outlier]]:
-    """Rows by their largest score, each with the value that it has it for, the largest first.
+    """Rows by their largest score, each with the value that has this score, the largest first.
 
     At most `most_each` rows for one measure, so that one odd quantity does not fill the list.
     """

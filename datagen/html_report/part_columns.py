@@ -54,7 +54,7 @@ class PartColumns:
 
     @property
     def sample_words(self) -> str:
-        """What was read: all 120,000 labels, or a random 256 of 900 shards: 100,000 of 350,000 labels."""
+        """The labels read: all 120,000 labels, or a random 256 of 900 shards: 100,000 of 350,000 labels."""
         if not self.is_sampled:
             return f"all {len(self):,} labels"
         chosen, whole = len(self.chosen), len(self.part.shards)

@@ -1,4 +1,4 @@
-"""The page of a report: an overview with what needs a look, then a section for each thing that was named."""
+"""The page of a report: an overview with the findings, then a section for each path."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ h2, h3 {{ scroll-margin-top: .5rem; }}
 
 @dataclass(frozen=True, eq=False)
 class _Section:
-    """One section of the page: its id, heading, row of the overview, what is worth a look, and HTML."""
+    """One section of the page: its id, heading, row of the overview, findings, and HTML."""
 
     id: str
     heading: str
-    row: tuple[str, str, str, str]  # of the overview: what it holds, positive or accuracy, state, cost
+    row: tuple[str, str, str, str]  # of the overview: contents, positive or accuracy, state, cost
     findings: Sequence[str]
     body: Sequence[str]
 
@@ -124,7 +124,7 @@ def _runs(
     wanted = [min(scenes, len(r.columns.shard)) if r.columns is not None else 0 for r in reports]
     with steps("scenes", sum(wanted)) as step:
         return [
-            _run(report, costs.get(report.part.place), count, given, step)
+            _run(report, costs.get(report.part.address), count, given, step)
             for report, count in zip(reports, wanted, strict=True)
         ]
 
@@ -141,7 +141,7 @@ def _run(
     source = part.spec.label_source
     return _Section(
         report.name,
-        f"Run {part.place}",
+        f"Run {part.address}",
         (f"{counted(part.labels, 'label')} by {source}", report.positive, state_words(report), spent),
         _findings(report),
         run_section(report, cost_section(cost) if cost is not None else [], scenes, given, step),
@@ -149,7 +149,7 @@ def _run(
 
 
 def _findings(report: PartReport) -> list[str]:
-    """What a person should look at first, the gravest first."""
+    """The findings for the overview, the most serious first."""
     found = [
         f"shard {r.shard} is in quarantine: {r.causes[-1] if r.causes else 'unknown cause'}"
         for r in report.quarantine[:3]

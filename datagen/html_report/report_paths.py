@@ -1,4 +1,4 @@
-"""What the paths of a report name: runs in their parts, sealed stores, checkpoints, evaluations."""
+"""The paths of a report: runs in their parts, sealed stores, checkpoints, evaluations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ReportedPart:
     `shards` are the committed ones within n, or slices of the sealed store by number.
     """
 
-    place: str
+    address: str
     specs: Sequence[Specification]  # several of a merged store
     names: frozenset[str]  # the stored arrays
     run: Run | None
@@ -49,10 +49,10 @@ class ReportedPart:
         return {}
 
     def read(self, shard: int, names: Sequence[str]) -> dict[str, Array]:
-        """Read these arrays of a shard, the rows within n alone. InputError for a damaged file."""
+        """Read these arrays of a shard, only the rows within n. InputError for a damaged file."""
         place = self._place(shard, names)
         if missing := [name for name in names if name not in self._arrays]:
-            # Shards of a run have arrays of the same form: another one does not decode.
+            # Shards of a run have arrays of the same form; an array of another form does not decode.
             self._arrays.update(place.metadata(missing))
         return place.read([self._arrays[name] for name in names])
 
@@ -84,7 +84,7 @@ class ReportPaths:
 
 
 def open_report_paths(paths: Sequence[str]) -> ReportPaths:
-    """Open the runs, and tell checkpoints from evaluations. InputError for what is neither."""
+    """Open the runs, and separate checkpoints from evaluations. InputError for other paths."""
     runs: list[tuple[str, tuple[ReportedPart, ...]]] = []
     checkpoints: list[Path] = []
     evaluations: list[Path] = []
@@ -120,8 +120,8 @@ def _open_run(path: str) -> tuple[ReportedPart, ...]:
         n = run.n
         shards = [shard for shard in sorted(run.committed()) if shard < run.layout.shards_for(n)]
         labels = sum(run.layout.rows_wanted(shard, n)[1] for shard in shards)
-        place, names = run.storage.url, _names(run.schema)
-        parts.append(ReportedPart(place, (run.manifest.spec,), names, run, shards, labels, {}))
+        address, names = run.storage.url, _names(run.schema)
+        parts.append(ReportedPart(address, (run.manifest.spec,), names, run, shards, labels, {}))
     return tuple(parts)
 
 

@@ -1,4 +1,4 @@
-"""Figures of a run: label balance over distance and angle, and its shards by what they measure."""
+"""Figures of a run: label balance over distance and angle, and the measures of its shards."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def draw_balance(columns: PartColumns) -> Figure:
 
 
 def angles_deg(columns: PartColumns) -> F64:
-    """Direction (N,) from the target to each base, from that to the observation camera, in [-180, 180)."""
+    """Angles (N,) at the target from the observation camera to each base, in degrees, [-180, 180)."""
     scenes = columns.scenes
     target, camera = scenes["target_center_m"][:, :2], scenes["T_world_camera"][:, :2, 3]
     seen_from = np.arctan2(*(camera - target).T[::-1])
@@ -77,7 +77,7 @@ def rate_by_scene(columns: PartColumns, rows: Bools) -> tuple[float, float, floa
     """Positive rate of some candidates with its 95% interval, scenes as units; nan where undefined.
 
     The variance is that of a ratio of two sums over S scenes, sum (y - p n)^2 / (sum n)^2 times S / (S - 1)
-    (Cochran, Sampling Techniques, 1977, section 6.4). Of a rate of 0 or 1: the exact interval of as many
+    (Cochran, Sampling Techniques, 1977, section 6.4). A rate of 0 or 1 has the exact interval of as many
     trials as scenes (Clopper and Pearson 1934).
     """
     count = columns.per_scene(rows)
@@ -142,7 +142,7 @@ def _draw_map(
 
 
 def draw_shards(shards: Sequence[int], measures: Sequence[Measure]) -> Figure:
-    """Draw every measure over the shards, with those that stand out."""
+    """Draw every measure over the shards, and mark the outliers."""
     figure = new_figure(12, 4.6)
     panels = np.asarray(figure.subplots(2, 3)).ravel().tolist()
     number = np.array(shards, np.float64)

@@ -1,4 +1,4 @@
-"""The section of one run: what it holds, where it comes from, cost, balance, failures, shards, scenes."""
+"""The section of one run: contents, provenance, cost, balance, failures, shards, scenes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _MOST_OUTLIERS, _MOST_QUARANTINED = 20, 50
 
 @dataclass(frozen=True, eq=False)
 class PartReport:
-    """What is known of a part once its columns are read. `name` is unique on the page."""
+    """A part with its columns, status and outliers. `name` is unique on the page."""
 
     name: str
     part: ReportedPart
@@ -79,7 +79,7 @@ def run_section(
     if columns is not None:
         body += [
             "<h3>Label balance</h3>",
-            f"<p class=note>Of {escape(columns.sample_words)}.</p>",
+            f"<p class=note>From {escape(columns.sample_words)}.</p>",
             html_figure(svg_of(draw_balance(columns), f"{report.name}-balance"), BALANCE_CAPTION),
             *_outcomes(columns),
             "<h3>Shards that stand out</h3>",
@@ -169,7 +169,7 @@ def _lineage(run: Run) -> list[str]:
 
 
 def _outcomes(columns: PartColumns) -> list[str]:
-    """Causes of failure, for labels that have one: of all candidates, and of those within reach."""
+    """Table of outcomes, of all candidates and of those within reach; empty for labels without outcomes."""
     if "outcome" not in columns.samples:
         return []
     codes, near = columns.samples["outcome"], columns.is_in_range
@@ -193,7 +193,7 @@ def _share(count: int, whole: int) -> str:
 def _shards(report: PartReport) -> list[str]:
     part, measures = report.part, {m.name: m for m in report.measures}
     if len(part.shards) < FEWEST:
-        return [f"<p>{counted(len(part.shards), 'shard')}: too few to tell which stand out.</p>"]
+        return [f"<p>{counted(len(part.shards), 'shard')}: too few to find outliers.</p>"]
     rows = [
         (
             str(part.shards[o.row]), o.measure, m.text(o.value), m.text(m.median), f"{o.score:+.1f}",
@@ -244,7 +244,7 @@ def _failures(report: PartReport) -> list[str]:
 
 
 def _folded(title: str, stacks: Sequence[str]) -> str:
-    """A summary that opens; without a stack it is only a line."""
+    """A summary that opens; only a line without a stack."""
     text = "".join(f"<pre>{_lines(stack)}</pre>" for stack in dict.fromkeys(stacks) if stack)
     if not text:
         return f"<p>{escape(title)}</p>"
@@ -252,5 +252,5 @@ def _folded(title: str, stacks: Sequence[str]) -> str:
 
 
 def _lines(text: str) -> str:
-    """Text whose line breaks are kept, escaped."""
+    """Escaped text with its line breaks."""
     return "\n".join(escape(line) for line in text.splitlines())

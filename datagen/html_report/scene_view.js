@@ -17,7 +17,7 @@
     const home = { yaw: scene.yaw, pitch: 0.55, zoom: 1 };
     const camera = { ...home };
     const pointers = new Map();
-    let shown = [], chosen = -1, asked = false, pinch = 0;
+    let shown = [], chosen = -1, frameRequested = false, pinch = 0;
 
     // The target frame has z up and its origin at the target's centre; the floor is at scene.floor.
     function projection() {
@@ -48,8 +48,8 @@
       context.stroke();
     }
 
-    function line(place, from, to, colour) {
-      const [x0, y0] = place(...from), [x1, y1] = place(...to);
+    function line(project, from, to, colour) {
+      const [x0, y0] = project(...from), [x1, y1] = project(...to);
       context.beginPath();
       context.moveTo(x0, y0);
       context.lineTo(x1, y1);
@@ -59,28 +59,28 @@
     }
 
     function draw() {
-      asked = false;
+      frameRequested = false;
       const ratio = window.devicePixelRatio || 1;
       const width = Math.max(1, Math.round(canvas.clientWidth * ratio));
       const height = Math.max(1, Math.round(canvas.clientHeight * ratio));
       if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
       context.fillStyle = "#ffffff";
       context.fillRect(0, 0, width, height);
-      const place = projection(), floor = scene.floor, half = Math.ceil(scene.radius * 2) / 2;
+      const project = projection(), floor = scene.floor, half = Math.ceil(scene.radius * 2) / 2;
       for (let at = -half; at <= half + 1e-6; at += 0.5) {
-        line(place, [at, -half, floor], [at, half, floor], "#e3e7eb");
-        line(place, [-half, at, floor], [half, at, floor], "#e3e7eb");
+        line(project, [at, -half, floor], [at, half, floor], "#e3e7eb");
+        line(project, [-half, at, floor], [half, at, floor], "#e3e7eb");
       }
-      line(place, [0, 0, floor], [0, 0, 0], scene.colours.target);
-      shown = scene.candidates.map(([x, y], k) => [...place(x, y, floor), k]);
+      line(project, [0, 0, floor], [0, 0, 0], scene.colours.target);
+      shown = scene.candidates.map(([x, y], k) => [...project(x, y, floor), k]);
       const items = [];
       for (let k = 0; k < count; k++) {
-        const [x, y, depth] = place(
+        const [x, y, depth] = project(
           points[3 * k] * scene.unit, points[3 * k + 1] * scene.unit, points[3 * k + 2] * scene.unit);
         items.push([depth, x, y, k]);
       }
       // Base poses lie on the floor: furniture in front of one hides it, but marks stay readable.
-      const dot = Math.max(1.5, 0.013 * place(0, 0, 0)[3]), mark = Math.min(9 * ratio, Math.max(3 * ratio, 0.025 * place(0, 0, 0)[3]));
+      const dot = Math.max(1.5, 0.013 * project(0, 0, 0)[3]), mark = Math.min(9 * ratio, Math.max(3 * ratio, 0.025 * project(0, 0, 0)[3]));
       items.sort((a, b) => b[0] - a[0]);
       for (const [, x, y, k] of items) {
         context.fillStyle = onTarget[k] ? scene.colours.target
@@ -103,8 +103,8 @@
     }
 
     function redraw() {
-      if (!asked) {
-        asked = true;
+      if (!frameRequested) {
+        frameRequested = true;
         requestAnimationFrame(draw);
       }
     }

@@ -1,4 +1,4 @@
-"""A scene on the page: why it is shown, its pictures, and a view of its cloud and base poses that turns."""
+"""The interactive view of a scene on the page: its point cloud and base poses."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ STYLE = """
 .scene-view output { display: block; min-height: 1.5em; font-size: .92rem; }
 """
 _MOST_UNITS = 32767
-_BESIDE_RAD = 0.35
+_SIDEWAYS_RAD = 0.35
 _SHOWN_PERCENT = 95
 VIEW_HELP = (
     "Drag a view to turn it, pinch to zoom. With a view in focus: arrow keys turn, + and - or the wheel "
@@ -51,7 +51,7 @@ _BUTTONS = (
 
 
 def scene_view(rows: SceneRows, name: str) -> str:
-    """The view of a scene as HTML; `name` says for screen readers which scene it is."""
+    """The view of a scene as HTML; `name` is its label for screen readers."""
     buttons = "".join(
         f'<button type="button" data-key="{key}" title="{title}" aria-label="{title}">{text}</button>'
         for key, text, title in _BUTTONS
@@ -64,7 +64,7 @@ def scene_view(rows: SceneRows, name: str) -> str:
 
 
 def _embedded(value: Any) -> str:
-    """JSON that cannot end the element that it lies in."""
+    """JSON that cannot close the HTML element that contains it."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
@@ -80,11 +80,11 @@ def _scene_data(rows: SceneRows) -> dict[str, Any]:
     center_m = np.asarray(record["target_center_m"], np.float64)
     base_m = np.asarray(samples["base_xy_m"], np.float64) - center_m[:2]
     floor_m = -float(center_m[2])
-    # What lies far off or high up, such as walls, may be cut off.
+    # Points far off or high up, such as walls, may be cut off.
     top_m = float(np.percentile(points_m[:, 2], _SHOWN_PERCENT)) if len(points_m) else 0.0
     wide_m = float(np.percentile(np.abs(points_m[:, :2]), _SHOWN_PERCENT)) if len(points_m) else 0.0
     base_radius_m = float(np.linalg.norm(base_m, axis=1).max(initial=0.0))
-    # A ball that holds cloud and base poses from wherever it is seen.
+    # Radius of a ball that contains cloud and base poses.
     radius_m = max(0.5, float(np.hypot(max(wide_m, base_radius_m), (top_m - floor_m) / 2)))
     return {
         "points": _packed(np.round(points_m / unit_m).astype("<i2")),
@@ -101,9 +101,9 @@ def _scene_data(rows: SceneRows) -> dict[str, Any]:
 
 
 def _first_yaw_rad(to_camera_m: np.ndarray[Any, Any]) -> float:
-    """The yaw at which one looks at the scene from a little beside the observation camera."""
+    """The first yaw of the view, a little to the side of the observation camera."""
     x, y = to_camera_m.tolist()
-    return round(float(np.arctan2(x, -y)) + _BESIDE_RAD, 3)
+    return round(float(np.arctan2(x, -y)) + _SIDEWAYS_RAD, 3)
 
 
 def _packed(values: np.ndarray[Any, Any]) -> str:
@@ -111,7 +111,7 @@ def _packed(values: np.ndarray[Any, Any]) -> str:
 
 
 def _candidates(samples: Any, base_m: np.ndarray[Any, Any]) -> list[list[Any]]:
-    """Each base pose: x, y, label, whether the base fits, and words that name it."""
+    """Each base pose: x, y, label, whether the base fits, and its name."""
     words = [str(k) for k in np.asarray(samples["candidate_index"]).tolist()]
     if "outcome" in samples:
         names: Sequence[str] = tuple(OUTCOMES)

@@ -47,7 +47,7 @@ def unusual_scenes(
 def _introduction(columns: PartColumns, count: int, measures: int) -> str:
     scenes = len(columns.shard)
     if scenes < FEWEST:
-        return f"{count} of {scenes} scenes: too few to tell which are unusual."
+        return f"{count} of {scenes} scenes: too few to find unusual ones."
     return (
         f"The {count} most unusual of {scenes:,} scenes ({columns.sample_words}), by the largest "
         ""
@@ -74,7 +74,7 @@ def _scene(columns: PartColumns, rows: SceneRows, reason: str, world: World | No
     pictures = ""
     if world is not None:
         try:
-            shown = Shown(columns.part.place, columns.part.spec, rows, reconstruct_scene(world, record))
+            shown = Shown(columns.part.address, columns.part.spec, rows, reconstruct_scene(world, record))
             names = ("RGB frame, target outlined", "the room from above with the base poses")
             pictures = "".join(
                 f'<figure><img src="{address}" alt="{name}"></figure>'

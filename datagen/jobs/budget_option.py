@@ -44,7 +44,7 @@ def parse_budget(text: str, prices: str | Path | None = None, fix: str = _FIX) -
 def budget_cpu_h(text: str, prices: str | Path | None = None) -> float:
     """Core-hours that a budget of CPU time or money pays for, without the price of storage.
 
-    InputError as of `parse_budget`, for a time, and for more than 1,000,000 core-hours.
+    InputError as from `parse_budget`, for a time, and for more than 1,000,000 core-hours.
     """
     budget = parse_budget(text, prices, _COST_FIX)
     if budget.spending is None:

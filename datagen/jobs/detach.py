@@ -22,10 +22,10 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import new_job_id
 
 _BEGUN_WITHIN_S = 60.0
-_LOOK_S = 0.3
+_POLL_S = 0.3
 
 
-def detach_job(words: Sequence[str], place: str, job_options: JobOptions) -> JobResult:
+def detach_job(words: Sequence[str], path: str, job_options: JobOptions) -> JobResult:
     """Run the command of these words as a Ray job, and print how to follow it.
 
     With the address `local`, it runs on a Ray head of this machine, which is started if needed. Returns once
@@ -50,18 +50,18 @@ def detach_job(words: Sequence[str], place: str, job_options: JobOptions) -> Job
         ("submission", submission),
         ("state", state.lower()),
         ("cluster", jobs.url),
-        ("follow", command_line(["status", place])),
-        ("", command_line(["logs", place, "--follow"])),
-        ("stop", command_line(["cancel", place])),
+        ("follow", command_line(["status", path])),
+        ("", command_line(["logs", path, "--follow"])),
+        ("stop", command_line(["cancel", path])),
     ]
     if job_options.address == "local":
         rows.append(("Ray", f"keeps running for later jobs; stop it: {command_line(['cancel', '--head'])}"))
     print_rows(f"detached: {command_line(words)}", rows)
-    return JobResult(place, "detached")
+    return JobResult(path, "detached")
 
 
 def hand_over(jobs: RayJobs, folder: Path, submission: str) -> Path:
-    """The file with the shell's variables for one job, which removes it; those of killed jobs go here."""
+    """Write the shell's variables to a file, which the job removes; remove the files of killed jobs."""
     for left in folder.glob("datagen-*.json"):
         if jobs.state(left.stem) in ENDED:
             left.unlink(missing_ok=True)
@@ -85,12 +85,12 @@ def _await_begin(jobs: RayJobs, submission: str) -> str:
     while True:
         state = jobs.state(submission)
         if state in ("FAILED", "STOPPED"):
-            said = jobs.output(submission).strip().splitlines()
-            why = said[-1].removeprefix("error: ") if said else jobs.message(submission)
+            output = jobs.output(submission).strip().splitlines()
+            why = output[-1].removeprefix("error: ") if output else jobs.message(submission)
             raise InputError(submission, "", f"ended at once: {why}", "Correct the command and submit again")
         if state != "PENDING" or time.monotonic() >= until_s:
             return state
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_S)
 
 
 def jobs_api_of(url: str) -> RayJobs:

@@ -1,4 +1,4 @@
-"""`--dry-run`: what a job would make and cost, without making it."""
+"""`--dry-run`: forecast the shards and the cost of a job without running it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _RAY_START_S = 5.0
 
 @dataclass(frozen=True, eq=False)
 class PlannedRun:
-    """One run of a job that is not started. `shards` are to be made; `run` is None before it exists."""
+    """One run of a job that is not started. `shards`: number to make. `run` is None before it exists."""
 
     manifest: Manifest
     run: Run | None
@@ -40,9 +40,9 @@ class PlannedRun:
 
 
 def dry_run(path: str, planned: Sequence[PlannedRun], job_options: JobOptions, began_s: float) -> JobResult:
-    """Forecast the shards of these runs. A run without shards here, or one like it, gets a pilot.
+    """Forecast the cost of these runs. No file is written at `path`.
 
-    Nothing is written at `path`.
+    A pilot runs where this machine made no shards of a run, nor of one like it.
     """
     workers = worker_count(job_options)
     shards = sum(each.shards for each in planned)
@@ -103,7 +103,7 @@ def _evidence(path: str, planned: PlannedRun, job_options: JobOptions, began_s: 
     evidence = run_pilot(planned.manifest, sources, selection, scenes, job_options, began_s)
     if planned.run is None or not planned.run.committed():
         return evidence
-    return Evidence(evidence.text, evidence.costs, evidence.start_s)  # its scenes are made already
+    return Evidence(evidence.text, evidence.costs, evidence.start_s)  # the pilot's scenes are made already
 
 
 def _work(planned: PlannedRun, evidence: Evidence, workers: int) -> Work:

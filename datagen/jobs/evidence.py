@@ -15,14 +15,14 @@ from datagen.schemas.record_files import MAX_RECORD_BYTES
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, Manifest
 
-# Fewer commits than this of another run are less than a pilot shows.
+# With fewer commits than this of another run, a pilot gives more evidence.
 _ENOUGH = 4
 _MOST_READ, _MOST_RUNS = 256, 200
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Made shards, and where they are from.
+    """The costs of made shards, and their origin.
 
     `start_s`: from the command to its first shard. `known`: the job makes them again.
     """
@@ -34,14 +34,14 @@ class Evidence:
 
 
 def made_here(run: Run) -> list[MadeShard]:
-    """The run's shards that this machine made, in order of time; of a large run, some of them."""
+    """The run's shards that this machine made, in order of time; a sample of them for a large run."""
     shards, here = sorted(run.committed()), this_host()
     step = -(-len(shards) // _MOST_READ) or 1
     commits: list[Commit] = []
     read = run.storage.get_many(map(commit_key, shards[::step]), MAX_RECORD_BYTES)
     for shard, (_, data) in zip(shards[::step], read, strict=True):
         with suppress(InputError):  # `verify` reports a damaged one
-            # One that only applied another rule to stored labels says nothing of making them.
+            # A relabelled shard does not show the cost of making labels.
             if data and not (commit := run.decode_commit(shard, data)).cost.source_s:
                 commits.append(commit)
     commits = [commit for commit in commits if commit.host.name == here.name]
@@ -49,7 +49,7 @@ def made_here(run: Run) -> list[MadeShard]:
 
 
 def costs_of(run: Run) -> SeenCosts:
-    """The costs of these shards."""
+    """The costs of the run's shards that this machine made."""
     costs = SeenCosts(BETWEEN_JOBS)
     for shard in made_here(run):
         costs.add(shard)
@@ -57,9 +57,9 @@ def costs_of(run: Run) -> SeenCosts:
 
 
 def made_shard(commit: Commit) -> MadeShard:
-    """What a commit says about its shard's cost.
+    """The cost of a shard, from its commit.
 
-    Writing takes about as long for one scene as for 32, and each array has one file that describes it.
+    Writing takes about as long for one scene as for 32, and each array has one metadata file.
     """
     return MadeShard(
         commit.scenes,
@@ -74,17 +74,17 @@ def made_shard(commit: Commit) -> MadeShard:
 def earlier_run(out: str, manifest: Manifest) -> tuple[Run, SeenCosts] | None:
     """The newest run of the same kind that this machine has made in the folder of `out`.
 
-    The same kind: the same specification but for its seed, the run with its scenes and the selection.
+    Runs of the same kind have the same specification except for seed, source of the scenes and selection.
     """
     if "://" in out:
         return None
     folder = Path(out).expanduser().absolute().parent
     found: list[Run] = []
     with suppress(OSError):
-        for place in sorted(folder.iterdir())[:_MOST_RUNS]:
-            if (place / "manifest.json").is_file():
+        for path in sorted(folder.iterdir())[:_MOST_RUNS]:
+            if (path / "manifest.json").is_file():
                 with suppress(InputError):
-                    run = Run.open(place)
+                    run = Run.open(path)
                     if _kind(run.manifest) == _kind(manifest):
                         found.append(run)
     for run in sorted(found, key=lambda run: run.manifest.created, reverse=True):

@@ -13,7 +13,7 @@ from datagen.reports.prices import Prices
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a job will make and cost. Every interval holds the truth in about 80 % of jobs.
+    """The shards and the cost of a job. Every interval holds the truth in about 80 % of jobs.
 
     Shards, scenes and labels are exact: shards are whole, and a scene that is rejected is sampled again.
     """

@@ -63,9 +63,9 @@ class JobPlan:
 
 
 def run_job(plan: JobPlan) -> JobResult:
-    """Make every missing shard, seal, and return what was done.
+    """Make every missing shard, seal, and return the result.
 
-    Meanwhile the job publishes its state in the run, and obeys stop requests that it finds there. Raises
+    Meanwhile the job publishes its state in the run, and polls it for stop requests. Raises
     InputError for an error that no retry can fix.
     """
     if not _count_missing(plan):
@@ -191,13 +191,13 @@ def _judged(plan: JobPlan, summary: JobSummary) -> JobSummary:
     """
     if summary.end not in ("complete", "failed") or summary.remaining:
         return summary
-    given_up = planned = 0
+    quarantined = planned = 0
     for job_run in plan.runs:
         shards = job_run.run.planned()
         planned += len(shards)
-        given_up += sum(shard in shards for shard in job_run.run.quarantined())
+        quarantined += sum(shard in shards for shard in job_run.run.quarantined())
     policy = RetryPolicy(max_quarantined_share=plan.options.max_quarantined)
-    failed = too_many_quarantined(policy, given_up, planned)
+    failed = too_many_quarantined(policy, quarantined, planned)
     return replace(summary, end="failed" if failed else "complete")
 
 
@@ -216,7 +216,7 @@ class _CannotContinue(InputError):
 
 
 def _finish(plan: JobPlan, summary: JobSummary) -> JobResult:
-    """Seal the run, unless the job was stopped, and return what was done."""
+    """Seal the run, unless the job was stopped, and return the result."""
     totals, runs = summary.totals, [job_run.run for job_run in plan.runs]
     causes = Counter(r.causes[-1] for run in runs for r in run.quarantine_records() if r.causes)
     if summary.end == "aborted":
@@ -244,24 +244,24 @@ def _finish(plan: JobPlan, summary: JobSummary) -> JobResult:
 
 
 class JobRecorder:
-    """The status records of one job over one run or several. `shards` are all that it has to make.
+    """The status records of one job over one run or several. `shards` is the number that it has to make.
 
-    A state that cannot be written, or a request that cannot be read, is passed over: what is wrong with
-    the store is said by the commits.
+    A state that cannot be written, or a request that cannot be read, is ignored: an error of the store also
+    fails the commits, which report it.
     """
 
     def __init__(self, jobs: Jobs, record: JobRecord, shards: int) -> None:
         self._jobs, self._record, self._shards = jobs, record, shards
-        self._before = JobTotals(0)  # of the runs that this job is through with
+        self._before = JobTotals(0)  # of the runs that this job has finished
         self._last = JobState(id=record.id, updated=utc_now(), phase="starting", shards=shards)
 
     def begin(self) -> None:
-        """Make the job known. InputError where that cannot be written: then nothing could."""
+        """Publish the job. InputError where its record cannot be written: then no shard could be."""
         self._jobs.begin(self._record)
         self._put(self._last)
 
     def add(self, totals: JobTotals) -> None:
-        """One run is done; `totals` is the job's up to here."""
+        """Record that a run is finished; `totals` are the job's so far."""
         self._before = totals
 
     def publish(self, status: JobStatus) -> None:
@@ -287,11 +287,11 @@ class JobRecorder:
         return None
 
     def seal(self) -> None:
-        """Say that the shards are made and the store is laid."""
+        """Publish that the shards are made and the store is being sealed."""
         self._put(self._last.model_copy(update={"updated": utc_now(), "phase": "sealing", "in_flight": 0}))
 
     def end(self, end: JobEnd | End, code: int, cause: str, summary: JobSummary | None = None) -> None:
-        """Say how the job ended."""
+        """Publish how the job ended."""
         update = {
             "updated": utc_now(),
             "phase": "ended",

@@ -1,4 +1,4 @@
-"""What a job did, and the jobs of a run, as plain values and as lines of text."""
+"""The result of a job, and the jobs of a run, as plain values and as lines of text."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from datagen.cluster.run_forecast import shown_range
 from datagen.cluster.shard_costs import Interval
-from datagen.console.command_lines import command_line, resume_with, say_interrupted
+from datagen.console.command_lines import command_line, print_interrupted, resume_with
 from datagen.console.printing import counted, listed, print_json, print_rows, seconds
 from datagen.jobs.forecast import Forecast, print_forecast
 from datagen.schemas.errors import one_line
@@ -23,7 +23,7 @@ _EXIT_CODES = {
 
 @dataclass(frozen=True, eq=False)
 class JobResult:
-    """What a job did, and what its run holds now. Quarantined shards are those that failed repeatedly."""
+    """The result of a job, and the state of its run. Quarantined shards are those that failed repeatedly."""
 
     path: str  # the run, as the user wrote it
     # detached: Ray makes the labels. failed: more shards are quarantined than allowed. budget: it allows no
@@ -52,20 +52,20 @@ class JobResult:
 
     @property
     def exit_code(self) -> int:
-        """The command line's exit status: 0 good, 1 too many failures, 2 bad place, 3 budget, 130 stopped."""
+        """The command line's exit status: 0 good, 1 too many failures, 2 aborted, 3 budget, 130 stopped."""
         return _EXIT_CODES[self.end]
 
 
 def job_report(job: StoredJob) -> dict[str, Any]:
     """One job: its record, its last state, and its health."""
     record, state = job.record, job.state
-    told = state.model_dump(mode="json", exclude={"format_version", "id"}) if state else {}
+    fields = state.model_dump(mode="json", exclude={"format_version", "id"}) if state else {}
     return {
         **record.model_dump(mode="json", exclude={"format_version"}),
         "health": job.health(),
         "heard_s": round(job.silence().total_seconds(), 1),
         "asked_to_stop": None if job.order is None else ("now" if job.order.now else "drain"),
-        "state": told,
+        "state": fields,
     }
 
 
@@ -102,15 +102,15 @@ def print_job(result: JobResult, *, job: Mapping[str, Any] | None = None, **_: A
         print_json({"run": result.path, **result.forecast.record()})
     elif result.forecast is not None:
         print_forecast(result.path, result.forecast)
-    elif result.end != "detached":  # what to do next is printed when it is detached
+    elif result.end != "detached":  # `detach_job` has printed how to follow it
         _print(result)
         if result.end == "budget":
-            _say_budget(result, as_json)
+            _print_budget(result, as_json)
     return result.exit_code
 
 
-def _say_budget(result: JobResult, as_json: bool) -> None:
-    """Say on standard error that the budget is spent, and how to continue with another one."""
+def _print_budget(result: JobResult, as_json: bool) -> None:
+    """Print on standard error that the budget is spent, and how to resume with another one."""
     if as_json:
         again = {"remaining": result.remaining, "exit_code": result.exit_code, "resume": list(result.resume)}
         values = {"event": "budget", "budget": result.budget, "labels": result.labels, **again}
@@ -147,7 +147,7 @@ def _print(result: JobResult) -> None:
         see = command_line(["status", path])
         sys.stderr.write(one_line(f"error: {path}: too many shards are quarantined{most}. See: {see}") + "\n")
     if result.end == "interrupted":
-        say_interrupted(f"; {counted(result.remaining, 'shard')} left", result.resume)
+        print_interrupted(f"; {counted(result.remaining, 'shard')} left", result.resume)
 
 
 def _time(result: JobResult) -> str:

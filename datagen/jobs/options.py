@@ -24,7 +24,7 @@ from datagen.schemas.progress import Progress
 from datagen.workers.extras import refuse_missing
 
 DEFAULT_SHARE = 0.01
-# Variables of a detached job: its name at Ray, and where Ray answers for it.
+# Environment variables of a detached job: its submission id at Ray, and the address of Ray's Jobs API.
 SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"
 _DETACH = (
     "Run as a Ray job that continues after this shell ends: on the cluster of --address (its dashboard "
@@ -95,7 +95,7 @@ class JobOptions:
         return None if self.budget is None else parse_budget(self.budget, self.prices)
 
     def display(self) -> Progress:
-        """What reports progress on standard error."""
+        """The display of progress on standard error."""
         return Progress(self.json, console=Console(file=io.StringIO()) if self.quiet else None)
 
     def words(self) -> list[str]:
@@ -118,7 +118,7 @@ def refuse_odd_n(n: int) -> None:
 
 @contextmanager
 def opening(words: Sequence[str], job_options: JobOptions) -> Generator[float]:
-    """Show that sources are opened and how to resume after an interrupt; gives the beginning by the clock."""
+    """Report that sources are opened, and how to resume after an interrupt; yield `beginning_s()`."""
     began_s = beginning_s()
     with resumable([*words, *job_options.address_words()]), job_options.display() as shown:
         shown.phase("opening houses and objects")
@@ -133,9 +133,9 @@ def absolute_source(ref: str) -> str:
     return refuse_not_utf8(f"{kind}:{Path(text).expanduser().resolve()}" if is_path else ref)
 
 
-def absolute_place(place: str | Path) -> str:
+def absolute_path(path: str | Path) -> str:
     """A run's absolute path or its address, valid in every folder."""
-    place = str(place)
-    if "://" in place and not place.startswith("file://"):
-        return place
-    return str(Path(place.removeprefix("file://")).expanduser().absolute())
+    path = str(path)
+    if "://" in path and not path.startswith("file://"):
+        return path
+    return str(Path(path.removeprefix("file://")).expanduser().absolute())

@@ -1,4 +1,4 @@
-"""A pilot: a few small shards of a run in a temporary folder, to learn what the run costs."""
+"""A pilot: a few small shards of a run in a temporary folder, to measure the cost of the run."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def run_pilot(
     if job_options.workers != 0:
         job_options = replace(job_options, workers=min(workers, shards))
     job_options = replace(job_options, dry_run=False, budget=_LIMIT)
-    # A shard that is killed at Ctrl-C may still write: what cannot be removed is left to the system.
+    # A shard that is killed at Ctrl-C may still write: the system removes files that are left.
     with TemporaryDirectory(prefix="datagen-pilot-", ignore_cleanup_errors=True) as folder:
         small = manifest.model_copy(update={"layout": layout})
         run = Run.create_or_open(open_storage(folder), small, shards * layout.samples_per_shard, selection)

@@ -15,7 +15,7 @@ from datagen.jobs.detach import detach_job, detached_words
 from datagen.jobs.dry_run import PlannedRun, dry_run
 from datagen.jobs.job import JobPlan, JobRun, run_job
 from datagen.jobs.job_report import JobResult
-from datagen.jobs.options import JobOptions, absolute_place, absolute_source, opening
+from datagen.jobs.options import JobOptions, absolute_path, absolute_source, opening
 from datagen.regeneration.scenes import open_sources
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import open_runs
@@ -36,7 +36,7 @@ def source_words(given: Sources) -> list[str]:
         {
             "--houses": given.houses and absolute_source(given.houses),
             "--objects": given.objects and absolute_source(given.objects),
-            "--scenes-from": given.scenes_from and absolute_place(given.scenes_from),
+            "--scenes-from": given.scenes_from and absolute_path(given.scenes_from),
         }
     )
 
@@ -61,7 +61,7 @@ def open_job_run(run: Run, given: Sources, address: str) -> JobRun:
         run,
         absolute_source(given.houses or known.get("houses", "builtin")),
         absolute_source(given.objects or known.get("objects", "builtin")),
-        "" if spec.scenes_from is None else absolute_place(given.scenes_from or known["scenes_from"]),
+        "" if spec.scenes_from is None else absolute_path(given.scenes_from or known["scenes_from"]),
     )
 
 
@@ -77,7 +77,7 @@ def continue_job(
 
     A dry run forecasts the shards of `planned` instead.
 
-    `words` are those of the command itself: a detached job is given them, and repeats `prepare`.
+    `words` are those of the command itself: a detached job runs it again, `prepare` included.
     """
     if job_options.detach and job_options.address != "local":
         return detach_job(words, path, job_options)
@@ -117,7 +117,7 @@ def start_job(
 
     `resume` are the words of the command that resumes, by default `datagen resume`.
     """
-    words = list(resume or ["resume", absolute_place(path), *source_words(given), *job_options.words()])
+    words = list(resume or ["resume", absolute_path(path), *source_words(given), *job_options.words()])
     words += detached_words() or job_options.address_words()
     with resumable(words):
         result = run_job(JobPlan(storage, path, job_runs, job_options, began_s, command, words))

@@ -34,11 +34,11 @@ _TRIED = 4
 def deep_findings(run: Run, k: int, origin: OpenedSources, rng: np.random.Generator) -> Iterator[Finding]:
     """Yield findings on k random committed samples and k random committed scenes of a run.
 
-    The samples are recomputed from their stored poses, the scenes are drawn again from their seeds.
-    Bit for bit where machine and versions are those that made them; elsewhere samples within the stated
-    tolerances, and of scenes what is drawn before any physics (docs/explanation/determinism.md). Scenes of
-    another run that is not there any more are not drawn again. Reads at most 2 k shards, one at a time. Keys
-    of the findings are those below the run's own place.
+    Samples are recomputed from their stored poses, scenes are sampled again from their seeds. Where machine
+    and versions are those that made them, they must be equal bit for bit. Elsewhere samples must be within
+    the stated tolerances, and scenes equal in all that is sampled before any physics
+    (docs/explanation/determinism.md). Scenes of another run that no longer exists are not sampled again.
+    Reads at most 2 k shards, one at a time. Keys of the findings are relative to the run's folder.
     """
     shards = sorted(run.committed())
     if not shards or k < 1:
@@ -47,12 +47,12 @@ def deep_findings(run: Run, k: int, origin: OpenedSources, rng: np.random.Genera
     per_shard, per_scene = run.layout.samples_per_shard, run.layout.candidates_per_scene
     of_shard = rng.choice(len(shards), k)
     within = rng.integers(per_shard, size=k)
-    places = sorted(
+    indices = sorted(
         {(shards[s] * per_shard + i) for s, i in zip(of_shard.tolist(), within.tolist(), strict=True)}
     )
-    for scene, group in groupby(places, key=lambda place: place // per_scene):
-        yield from _checked(run, scene, _sample_findings(replayer, scene, [p % per_scene for p in group]))
-    if replayer.drawing is None:
+    for scene, group in groupby(indices, key=lambda i: i // per_scene):
+        yield from _checked(run, scene, _sample_findings(replayer, scene, [i % per_scene for i in group]))
+    if replayer.sampling_world is None:
         return
     of_shard = rng.choice(len(shards), k)
     within = rng.integers(run.layout.scenes_per_shard, size=k)
@@ -90,7 +90,7 @@ def _scene_findings(replayer: Replayer, scene: int, rows: list[int]) -> Iterator
     run, stages = replayer.run, tuple(STAGES)
     stored = next(read_scenes(run, [scene]))
     kept = chosen_rows(stored, rows)
-    made = replayer.redraw(int(stored.record["scene_index"]), kept.samples["candidate_index"].tolist())
+    made = replayer.sample_again(int(stored.record["scene_index"]), kept.samples["candidate_index"].tolist())
     if what_differs_here(run, scene // run.layout.scenes_per_shard):
         # Other physics results may cause a resampling, after which all draws differ.
         stages = DRAWN[:1] if int(made.record["retry"]) == int(stored.record["retry"]) else ()
@@ -98,10 +98,10 @@ def _scene_findings(replayer: Replayer, scene: int, rows: list[int]) -> Iterator
 
 
 def _of_stages(run: Run, scene: int, stages: list[StageComparison], how: str) -> Iterator[Finding]:
-    apart = [stage for stage in stages if not stage.equal]
-    if apart:
+    different = [stage for stage in stages if not stage.equal]
+    if different:
         # Later stages follow from the first that differs.
-        first = apart[0]
+        first = different[0]
         text = "; ".join(str(d) for d in first.differences)
         yield _finding(run, scene, f"{how}: {first.stage}: {text}", first.differences[0].field)
 

@@ -26,31 +26,31 @@ from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstru
 from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.world import World, assemble_world, open_world
 
-_NO_DRAWING = "the run that made the scenes does not exist any more"
+_NO_SCENES = "the run that made the scenes does not exist any more"
 _FIX = "Give that run with --scenes-from"
 
 
 @dataclass(frozen=True, eq=False)
 class Replayer:
-    """A run opened to make its scenes again; `drawing` is None where the run that sampled them is gone."""
+    """A run opened to make its scenes again; `sampling_world` is None without the run that sampled them."""
 
     run: Run
     world: World
-    drawing: World | None
+    sampling_world: World | None
 
-    def redraw(self, scene: int, rows: Sequence[int] | None = None) -> SceneRows:
+    def sample_again(self, scene: int, rows: Sequence[int] | None = None) -> SceneRows:
         """Sample scene `scene` from its seeds as a worker does, rejections included, and label it.
 
         `rows` selects the candidates to label; by default all. Raises InputError where no scene can be made.
         """
-        if self.drawing is None:
-            raise InputError(self.run.storage.url, "scenes_from", _NO_DRAWING, _FIX)
-        drawn, candidates = generate_scene(self.drawing, scene, StageClock())
-        plain = scene_row(drawn)
+        if self.sampling_world is None:
+            raise InputError(self.run.storage.url, "scenes_from", _NO_SCENES, _FIX)
+        sampled, candidates = generate_scene(self.sampling_world, scene, StageClock())
+        plain = scene_row(sampled)
         fields = self.run.schema.scene_fields
         record = {f.name: np.array(plain[f.name], object if f.is_text else f.dtype) for f in fields}
-        settled: SettledScene = drawn
-        if self.drawing is not self.world:  # the scene of another run is labelled from its record
+        settled: SettledScene = sampled
+        if self.sampling_world is not self.world:  # the scene of another run is labelled from its record
             settled = reconstruct_scene(self.world, record)
         chosen = range(len(candidates)) if rows is None else rows
         return SceneRows(record, self._samples(settled, candidates, chosen))
@@ -74,19 +74,19 @@ class Replayer:
 
 def open_replayer(run: Run, origin: OpenedSources) -> Replayer:
     """Open a run to make its scenes again from its sources."""
-    drawn_by = run if origin.scenes is None else origin.scenes
-    while drawn_by is not None and drawn_by.manifest.spec.scenes_from is not None:
+    sampled_by = run if origin.scenes is None else origin.scenes
+    while sampled_by is not None and sampled_by.manifest.spec.scenes_from is not None:
         try:
-            drawn_by = source_of(drawn_by)
+            sampled_by = source_of(sampled_by)
         except InputError:
-            drawn_by = None
-    if drawn_by is run:
+            sampled_by = None
+    if sampled_by is run:
         return Replayer(run, origin.world, origin.world)
-    if drawn_by is None:
+    if sampled_by is None:
         return Replayer(run, origin.world, None)
     houses, objects = origin.world.houses, origin.world.objects
-    drawing = assemble_world(drawn_by.manifest.spec, houses, objects, "--houses", "--objects")
-    return Replayer(run, origin.world, drawing)
+    sampling_world = assemble_world(sampled_by.manifest.spec, houses, objects, "--houses", "--objects")
+    return Replayer(run, origin.world, sampling_world)
 
 
 def chosen_rows(stored: SceneRows, rows: Sequence[int]) -> SceneRows:
@@ -160,13 +160,13 @@ def open_sources(run: Run, given: Sources = AS_FOUND, needs_scenes: bool = True)
 
 def source_of(run: Run, given: Sources = AS_FOUND) -> Run:
     """The run whose scenes this one labelled. InputError where it is missing or has other scenes."""
-    place = given.scenes_from or run.manifest.sources.get("scenes_from", "")
+    path = given.scenes_from or run.manifest.sources.get("scenes_from", "")
     fix = "Give --scenes-from with the run that this one was started with"
-    if not place:
+    if not path:
         raise InputError(run.storage.url, "scenes_from", "is not in the run's manifest", fix)
-    source = Run.open(place)
+    source = Run.open(path)
     if source.manifest.spec.scenes_hash != run.manifest.spec.scenes_hash:
-        raise InputError(place, "spec_hash", "has other scenes than this run", fix)
+        raise InputError(path, "spec_hash", "has other scenes than this run", fix)
     return source
 
 

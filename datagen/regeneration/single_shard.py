@@ -21,7 +21,7 @@ class ShardFailed(Exception):
     """A replayed shard failed. This is a defect and not bad input, so it keeps its traceback."""
 
 
-def replay_shard(place: str, run: Run, shard: int, origin: OpenedSources, json: bool = False) -> int:
+def replay_shard(path: str, run: Run, shard: int, origin: OpenedSources, json: bool = False) -> int:
     """Print the shard's recorded failures, and make it again; return the exit code.
 
     Exceptions of the computation are not caught; an InputError is wrapped in `ShardFailed`. The shard is
@@ -30,11 +30,11 @@ def replay_shard(place: str, run: Run, shard: int, origin: OpenedSources, json: 
     planned = run.planned()
     if shard not in planned:
         fix = f"Give one from 0 to {len(planned) - 1}"
-        raise InputError(place, "--shard", f"{shard} is not in this run", fix)
+        raise InputError(path, "--shard", f"{shard} is not in this run", fix)
     record = next((r for r in run.quarantine_records() if r.shard == shard), None)
     failed = _recorded(run, shard, record)
     if not json:
-        _print_recorded(place, shard, record, failed)
+        _print_recorded(path, shard, record, failed)
     if sys.__stderr__ is not None:
         faulthandler.enable(sys.__stderr__)  # also prints the stack of a native crash
     made = _make(run, shard, origin)
@@ -48,12 +48,12 @@ def replay_shard(place: str, run: Run, shard: int, origin: OpenedSources, json: 
         "committed": differing is not None,
         "differing_files": differing or [],
         "quarantined": record is not None,
-        "fix": None if record is None else f"datagen resume {shlex.quote(place)} --quarantined",
+        "fix": None if record is None else f"datagen resume {shlex.quote(path)} --quarantined",
     }
     if json:
         print_json(report)
     else:
-        _print_made(place, report)
+        _print_made(path, report)
     return 1 if differing else 0
 
 
@@ -90,22 +90,22 @@ def _recorded(run: Run, shard: int, record: QuarantineRecord | None) -> list[dic
 
 
 def _print_recorded(
-    place: str, shard: int, record: QuarantineRecord | None, failed: list[dict[str, str]]
+    path: str, shard: int, record: QuarantineRecord | None, failed: list[dict[str, str]]
 ) -> None:
     state = "" if record is None else f", quarantined at {record.created}"
-    print_rows(f"shard {shard} of {place}{state}", [(f["attempt"], f["cause"]) for f in failed])
+    print_rows(f"shard {shard} of {path}{state}", [(f["attempt"], f["cause"]) for f in failed])
     stacks = [f["stack"].rstrip() for f in failed if f["stack"].strip()]
     if stacks:
         print_lines(f"the last recorded stack:\n{stacks[-1]}")
     print_lines("now on this machine:")
 
 
-def _print_made(place: str, report: dict[str, Any]) -> None:
+def _print_made(path: str, report: dict[str, Any]) -> None:
     rows = [("made", f"{report['labels']} labels, {report['positives']} positive; no file was written")]
     if report["committed"]:
-        apart = report["differing_files"]
-        same = "equal, bit for bit" if not apart else f"{len(apart)} differ, first {apart[0]}"
-        rows.append(("committed files", same))
+        differing = report["differing_files"]
+        result = "equal, bit for bit" if not differing else f"{len(differing)} differ, first {differing[0]}"
+        rows.append(("committed files", result))
     if report["fix"]:
         rows.append(("to try it again", report["fix"]))
-    print_rows(f"shard {report['shard']} of {place}: runs without failure", rows)
+    print_rows(f"shard {report['shard']} of {path}: runs without failure", rows)

@@ -49,7 +49,7 @@ DRAWN = ("draw", "settle", "observe", "candidates")
 # Stages that are computed again from stored poses.
 RECOMPUTED = ("candidates", "visibility", "grasps", "plan", "execute", "labels")
 
-# What rows of another platform or version may differ by (docs/explanation/determinism.md).
+# Tolerances between platforms and versions (docs/explanation/determinism.md).
 PX_TOLERANCE = 3
 DISTANCE_TOLERANCE_M = 2e-6
 SCORE_TOLERANCE = 2e-5
@@ -114,8 +114,8 @@ def _difference(field: Field, stored: Array, made: Array) -> FieldDifference | N
     if field.is_text:
         n = int((stored.astype(object) != made.astype(object)).sum())
         return FieldDifference(field.name, field.unit, n, None) if n else None
-    apart = _bits(stored, field) != _bits(made, field)
-    if not apart.any():
+    differing = _bits(stored, field) != _bits(made, field)
+    if not differing.any():
         return None
     with np.errstate(invalid="ignore", over="ignore"):
         gaps = np.abs(stored.astype(np.float64) - made.astype(np.float64))
@@ -123,7 +123,7 @@ def _difference(field: Field, stored: Array, made: Array) -> FieldDifference | N
     if field.name == "sample_id":  # the size of a difference between hashes is meaningless
         finite = finite[:0]
     largest = float(finite.max()) if finite.size else None
-    return FieldDifference(field.name, field.unit, int(apart.sum()), largest)
+    return FieldDifference(field.name, field.unit, int(differing.sum()), largest)
 
 
 def _bits(values: Array, field: Field) -> Array:

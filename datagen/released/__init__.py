@@ -14,27 +14,27 @@ FOLDER = Path(str(files("datagen.released")))
 CHECKPOINT, RESULTS, FRAME = "model.safetensors", "results.json", "frame"
 # The facts, how the model was made, and the page of both.
 CARD, RECIPE, CARD_PAGE = "card.json", "recipe.md", "MODEL_CARD.md"
-# What `datagen predict --demo` asks on the sample frame: a pixel on the blue cup, and a robot.
+# The click (a pixel on the blue cup) and the robot of `datagen predict --demo` on the sample frame.
 DEMO_CLICK = (390, 256)
 DEMO_BASE_HEIGHT_M, DEMO_REACH_M = 0.7, 0.9
 
 
 def released_checkpoint() -> Path:
     """The checkpoint of the released model."""
-    return _there(CHECKPOINT)
+    return _shipped_path(CHECKPOINT)
 
 
 def sample_frame() -> Path:
     """The folder of the sample frame, as `datagen predict --frame` reads it."""
-    return _there(FRAME)
+    return _shipped_path(FRAME)
 
 
 def released_card() -> dict[str, Any]:
     """The facts of the model card."""
-    return json.loads(_there(CARD).read_bytes())
+    return json.loads(_shipped_path(CARD).read_bytes())
 
 
-def _there(name: str) -> Path:
+def _shipped_path(name: str) -> Path:
     if not (path := FOLDER / name).exists():
         raise InputError(path, "", "does not exist", "Install the package again")
     return path

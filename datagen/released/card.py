@@ -65,21 +65,21 @@ def _about(card: Facts) -> str:
 def _metrics(card: Facts) -> str:
     version, digest = card["benchmark"]["version"], card["benchmark"]["digest"][:12]
     decisions = [
-        (run, f"{told['count']:,} of {told['scenes']:,} scenes", _interval(told["balanced_accuracy"]),
-         _interval(told["area_under_roc"]), _percent(told["expected_calibration_error"]),
-         _interval(told["accuracy"]))
-        for run, told in card["metrics"].items() if "balanced_accuracy" in told
+        (run, f"{scores['count']:,} of {scores['scenes']:,} scenes", _interval(scores["balanced_accuracy"]),
+         _interval(scores["area_under_roc"]), _percent(scores["expected_calibration_error"]),
+         _interval(scores["accuracy"]))
+        for run, scores in card["metrics"].items() if "balanced_accuracy" in scores
     ]  # fmt: skip
-    grids = {run: told for run, told in card["metrics"].items() if "good" in told}
+    grids = {run: scores for run, scores in card["metrics"].items() if "good" in scores}
     text = f"## Results\n\nIn percent, on benchmark version {version} ({digest}), 95% intervals by scene:\n\n"
     heads = ("run", "candidates", "balanced accuracy", "AUC", "calibration error", "accuracy")
     text += _table(heads, decisions)
     if grids:
         arrivals = list(next(iter(grids.values()))["arrivals"])
         rows = [
-            (run, f"{told['scenes']:,}", _interval(told["good"]), pick,
-             *(_percent(told["arrivals"][a][pick]["value"]) for a in arrivals))
-            for run, told in grids.items() for pick in ("nominal", "smoothed")
+            (run, f"{scores['scenes']:,}", _interval(scores["good"]), pick,
+             *(_percent(scores["arrivals"][a][pick]["value"]) for a in arrivals))
+            for run, scores in grids.items() for pick in ("nominal", "smoothed")
         ]  # fmt: skip
         text += "\nPicks on whole grids, and their success where the robot parks off them:\n\n"
         text += _table(("run", "grids", "best cell good", "pick", *arrivals), rows)
@@ -111,7 +111,7 @@ def _percent(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.1f}"
 
 
-def _interval(told: Facts) -> str:
-    if told["low"] is None:
-        return _percent(told["value"])
-    return f"{_percent(told['value'])} [{_percent(told['low'])}, {_percent(told['high'])}]"
+def _interval(estimate: Facts) -> str:
+    if estimate["low"] is None:
+        return _percent(estimate["value"])
+    return f"{_percent(estimate['value'])} [{_percent(estimate['low'])}, {_percent(estimate['high'])}]"

@@ -90,54 +90,56 @@ def common_candidates(a: Labelled, b: Labelled) -> tuple[Labelled, Labelled]:
     return a.at(rows_a), b.at(rows_b)
 
 
-def confusion(said: Bools, true: Bools) -> dict[str, int]:
-    """Confusion counts of predicted labels `said` (N,) and reference labels `true` (N,)."""
+def confusion(predicted: Bools, true: Bools) -> dict[str, int]:
+    """Confusion counts of labels `predicted` (N,) and reference labels `true` (N,)."""
     return {
-        "true_positive": int((said & true).sum()),
-        "false_positive": int((said & ~true).sum()),
-        "false_negative": int((~said & true).sum()),
-        "true_negative": int((~said & ~true).sum()),
+        "true_positive": int((predicted & true).sum()),
+        "false_positive": int((predicted & ~true).sum()),
+        "false_negative": int((~predicted & true).sum()),
+        "true_negative": int((~predicted & ~true).sum()),
     }
 
 
-def agreement(said: Bools, true: Bools) -> dict[str, Any]:
+def agreement(predicted: Bools, true: Bools) -> dict[str, Any]:
     """Counts, shares and accuracies; None where they are undefined.
 
     Balanced accuracy is the mean of sensitivity and specificity: 0.5 for a constant rule, however rare
     positives are.
     """
     n, positives = len(true), int(true.sum())
-    found = float(said[true].mean()) if positives else None
-    refused = float((~said)[~true].mean()) if positives < n else None
+    sensitivity = float(predicted[true].mean()) if positives else None
+    specificity = float((~predicted)[~true].mean()) if positives < n else None
     return {
         "count": n,
-        "said_positive": int(said.sum()),
+        "said_positive": int(predicted.sum()),
         "true_positive_share": positives / n if n else None,
-        "accuracy": float((said == true).mean()) if n else None,
-        "balanced_accuracy": (found + refused) / 2 if found is not None and refused is not None else None,
+        "accuracy": float((predicted == true).mean()) if n else None,
+        "balanced_accuracy": (sensitivity + specificity) / 2
+        if sensitivity is not None and specificity is not None
+        else None,
     }
 
 
-def compare(said: Labelled, true: Labelled) -> dict[str, Any]:
-    """Compare the labels of `said` with those of `true`, for the same candidates in the same order.
+def compare(predicted: Labelled, true: Labelled) -> dict[str, Any]:
+    """Compare the labels of `predicted` with those of `true`, for the same candidates in the same order.
 
     Intervals of 95% are by scene (`scene_intervals`). Groups are by quantities of `true`.
     """
 
-    def by_code(group: npt.NDArray[np.integer[Any]], heads: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        estimates = estimates_by_group(said.label, true.label, true.scene, group, len(heads))
-        each = (group == g for g in range(len(heads)))
+    def by_code(group: npt.NDArray[np.integer[Any]], keys: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        estimates = estimates_by_group(predicted.label, true.label, true.scene, group, len(keys))
+        each = (group == g for g in range(len(keys)))
         return [
-            head | agreement(said.label[rows], true.label[rows]) | estimate
-            for head, rows, estimate in zip(heads, each, estimates, strict=True)
+            key | agreement(predicted.label[rows], true.label[rows]) | estimate
+            for key, rows, estimate in zip(keys, each, estimates, strict=True)
         ]
 
     def by_band(values: Floats, edges: Edges) -> list[dict[str, Any]]:
-        group, heads = np.zeros(len(true), np.int64), list[dict[str, Any]]()
+        group, keys = np.zeros(len(true), np.int64), list[dict[str, Any]]()
         for low, high, rows in bands(values, edges):
-            group[rows] = len(heads)
-            heads.append({"low": low, "high": high})
-        return by_code(group, heads)
+            group[rows] = len(keys)
+            keys.append({"low": low, "high": high})
+        return by_code(group, keys)
 
     def by_name(key: str, values: npt.NDArray[Any]) -> list[dict[str, Any]]:
         names, codes = codes_of(values)
@@ -148,7 +150,7 @@ def compare(said: Labelled, true: Labelled) -> dict[str, Any]:
     (whole,) = by_code(np.zeros(len(true), np.int64), [{}])
     return {
         **whole,
-        "confusion": confusion(said.label, true.label),
+        "confusion": confusion(predicted.label, true.label),
         "by_distance": by_band(true.distance_m, DISTANCE_EDGES_M),
         "by_distance_over_reach": by_band(over_reach, OVER_REACH_EDGES),
         "by_visibility": by_band(true.visibility, VISIBILITY_EDGES),
@@ -157,23 +159,23 @@ def compare(said: Labelled, true: Labelled) -> dict[str, Any]:
         "by_object": by_name("object", true.target),
         "by_furniture": by_name("furniture", true.furniture),
         "by_side": by_name("side", sides),
-        "by_outcome": _by_outcome(said, true),
-        "error_map": error_map(said.label, true.label, true.edge_xy_m),
+        "by_outcome": _by_outcome(predicted, true),
+        "error_map": error_map(predicted.label, true.label, true.edge_xy_m),
     }
 
 
-def _by_outcome(said: Labelled, true: Labelled) -> list[dict[str, Any]]:
+def _by_outcome(predicted: Labelled, true: Labelled) -> list[dict[str, Any]]:
     """For each outcome of `true`, its count, the predicted positives, and the accuracy with its interval."""
     if true.outcome is None:
         return []
     codes, group = np.unique(true.outcome, return_inverse=True)
-    estimates = estimates_by_group(said.label, true.label, true.scene, group, len(codes))
+    estimates = estimates_by_group(predicted.label, true.label, true.scene, group, len(codes))
     names = tuple(OUTCOMES)
     return [
         {
             "outcome": names[code],
             "count": estimate["count"],
-            "said_positive": int(said.label[group == g].sum()),
+            "said_positive": int(predicted.label[group == g].sum()),
             **{key: estimate[key] for key in ("scenes", "accuracy", "accuracy_interval")},
         }
         for g, (code, estimate) in enumerate(zip(codes.tolist(), estimates, strict=True))

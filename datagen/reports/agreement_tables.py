@@ -21,7 +21,7 @@ _NAMED = {
 
 
 def print_agreement(report: dict[str, Any]) -> None:
-    """Print one line for each run with a truth: its agreement on whole grids and within reach."""
+    """Print the agreement of each run with its reference, on whole grids and within reach."""
     compared = [one for one in report["correct_labels"] if not one["is_truth"]]
     rows = [
         (
@@ -44,14 +44,14 @@ def print_agreement(report: dict[str, Any]) -> None:
 
 def print_pair(pair: dict[str, Any]) -> None:
     """Print the agreement of two runs with labels of the same candidates."""
-    said, true = (name_of(pair[side]) for side in ("said_by", "true_by"))
-    if said == true:
-        said, true = "first", "second"
+    source, reference = (name_of(pair[side]) for side in ("said_by", "true_by"))
+    if source == reference:
+        source, reference = "first", "second"
     print_rows(
-        f"{said} against {true}",
+        f"{source} against {reference}",
         [
-            (said, pair["said_by"]["run"]),
-            (true, pair["true_by"]["run"]),
+            (source, pair["said_by"]["run"]),
+            (reference, pair["true_by"]["run"]),
             ("candidates", f"{pair['count']:,} ({set_name(pair['candidates'])})"),
         ],
     )
@@ -61,15 +61,15 @@ def print_pair(pair: dict[str, Any]) -> None:
     print_rows(
         "confusion",
         [
-            (f"{said} 1", f"{counts['true_positive']:,}", f"{counts['false_positive']:,}"),
-            (f"{said} 0", f"{counts['false_negative']:,}", f"{counts['true_negative']:,}"),
+            (f"{source} 1", f"{counts['true_positive']:,}", f"{counts['false_positive']:,}"),
+            (f"{source} 0", f"{counts['false_negative']:,}", f"{counts['true_negative']:,}"),
         ],
-        ("", f"{true} 1", f"{true} 0"),
+        ("", f"{reference} 1", f"{reference} 0"),
     )
     costs = pair["wall_s_per_correct_label"]
     spent = [
         (f"cost of a correct label, {side}", f"{1000 * cost:.3f} ms wall" if cost is not None else "-")
-        for side, cost in ((said, costs["said_by"]), (true, costs["true_by"]))
+        for side, cost in ((source, costs["said_by"]), (reference, costs["true_by"]))
     ]
     print_rows(
         "agreement",
@@ -81,9 +81,9 @@ def print_pair(pair: dict[str, Any]) -> None:
         ],
     )
     for key, (title, unit) in _GROUPS.items():
-        _print_groups(title, unit, [(band_name(g), g) for g in pair[f"by_{key}"]], said, true)
+        _print_groups(title, unit, [(band_name(g), g) for g in pair[f"by_{key}"]], source, reference)
     for key, (title, unit) in _NAMED.items():
-        _print_groups(title, unit, [(g[key], g) for g in pair[f"by_{key}"]], said, true)
+        _print_groups(title, unit, [(g[key], g) for g in pair[f"by_{key}"]], source, reference)
     rows = [
         (
             o["outcome"],
@@ -93,11 +93,11 @@ def print_pair(pair: dict[str, Any]) -> None:
         )
         for o in pair["by_outcome"]
     ]
-    print_rows(f"by outcome of {true}", rows, ("outcome", "count", f"{said} 1", "accuracy"))
+    print_rows(f"by outcome of {reference}", rows, ("outcome", "count", f"{source} 1", "accuracy"))
 
 
 def _print_groups(
-    title: str, unit: str, groups: list[tuple[str, dict[str, Any]]], said: str, true: str
+    title: str, unit: str, groups: list[tuple[str, dict[str, Any]]], source: str, reference: str
 ) -> None:
     rows = [
         (
@@ -111,12 +111,12 @@ def _print_groups(
         )
         for name, g in groups
     ]
-    print_rows(title, rows, (unit, "count", f"{said} 1", f"{true} 1", "accuracy", "balanced", "kappa"))
+    print_rows(title, rows, (unit, "count", f"{source} 1", f"{reference} 1", "accuracy", "balanced", "kappa"))
 
 
-def name_of(who: dict[str, Any]) -> str:
+def name_of(record: dict[str, Any]) -> str:
     """The label source of a run, with `disturbed`."""
-    return f"{who['label_source']} disturbed" if who["disturbed"] else who["label_source"]
+    return f"{record['label_source']} disturbed" if record["disturbed"] else record["label_source"]
 
 
 def set_name(candidates: str) -> str:

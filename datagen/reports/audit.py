@@ -62,7 +62,7 @@ def _source(source: str, group: Sequence[AuditedRun], candidates: str, prices: P
 def ratios(sources: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return, for every two label sources, the cost of a label of the second divided by that of the first.
 
-    Of any label (worker time, without borrowed scenes), and of one within reach (core time, with them).
+    For any label in worker time, without borrowed scenes; for one within reach in core time, with them.
     """
     found: list[dict[str, Any]] = []
     for first, second in combinations(sources, 2):
@@ -83,7 +83,7 @@ def ratios(sources: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def balance_record(sums: Balance) -> dict[str, Any]:
-    """The sums of ledgers as plain values, with the findings that break them."""
+    """The sums of ledgers as plain values, with the findings of records that differ."""
     return {
         "exact": sums.is_exact,
         **{name: getattr(sums, name) for name in ("ledger_s", "commits_s", "waste_s", "difference_s")},

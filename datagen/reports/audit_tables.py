@@ -17,13 +17,13 @@ _UNITS = {
     "positive_within_reach": "a positive within reach",
     "accepted_scene": "an accepted scene",
 }
-# The unit in which the paper and the projections count days of each label source.
+# Label sources whose times the paper and the projections state in weeks; others are in days.
 _WEEKS = ("sim",)
 _SHOWN = 20
 
 
 def print_costs(report: dict[str, Any], prices: Prices) -> None:
-    """Print the most important numbers of an audit: sums that fail, costs by label source, projections."""
+    """Print the most important numbers of an audit: sums that differ, costs by label source, projections."""
     _print_findings(report["balance"])
     sources = [source for source in report["sources"] if source["labels"]]
     if not sources:

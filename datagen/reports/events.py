@@ -32,20 +32,20 @@ _NOTHING = Event("", "", "", "")
 Known = dict[str, Event]
 
 
-def events_of(place: Storage, shard: int | None = None, known: Known | None = None) -> list[Event]:
+def events_of(storage: Storage, shard: int | None = None, known: Known | None = None) -> list[Event]:
     """Return the events of a run, or of merged runs, in order of time; `known` keeps those of the ledger."""
     known = {} if known is None else known
-    found = _job_events(place) if shard is None else []
-    runs = open_runs(place)
+    found = _job_events(storage) if shard is None else []
+    runs = open_runs(storage)
     for number, run in enumerate(runs):
         part = f"part {number}: " if len(runs) > 1 else ""
         found += _attempt_events(run, part, shard, known) + _quarantine_events(run, part, shard)
     return sorted(found, key=lambda event: (event.at, event.key))
 
 
-def _job_events(place: Storage) -> list[Event]:
+def _job_events(storage: Storage) -> list[Event]:
     events: list[Event] = []
-    for job in Jobs(place).all():
+    for job in Jobs(storage).all():
         record, state, order = job.record, job.state, job.order
         where = f"on {record.host}, process {record.pid}"
         if record.submission:
@@ -65,8 +65,8 @@ def _job_events(place: Storage) -> list[Event]:
             events.append(Event(state.updated, f"{job.id} ended", "job_ended", text))
         elif job.health() == "dead":
             text = f"job {job.id} is dead: its process has ended; this was its last sign"
-            heard = state.updated if state else record.started
-            events.append(Event(heard, f"{job.id} dead", "job_dead", text))
+            last_seen = state.updated if state else record.started
+            events.append(Event(last_seen, f"{job.id} dead", "job_dead", text))
     return events
 
 
@@ -115,9 +115,9 @@ def _quarantine_events(run: Run, part: str, shard: int | None) -> list[Event]:
             if shard is not None and record.shard != shard:
                 continue
             last = record.causes[-1] if record.causes else "unknown cause"
-            since = " (tried again later)" if lifted else ""
+            note = " (tried again later)" if lifted else ""
             tried = counted(len(record.attempts), "attempt")
-            text = f"{part}shard {record.shard} is quarantined after {tried}{since}: {last}"
+            text = f"{part}shard {record.shard} is quarantined after {tried}{note}: {last}"
             key = f"{run.storage.url} {record.shard} given up {record.created}"
             stack = record.stacks[-1] if record.stacks else ""
             events.append(Event(record.created, key, "quarantined", text, stack, record.shard))

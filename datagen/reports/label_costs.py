@@ -1,8 +1,8 @@
-"""What labels cost: seconds and money of a label source, by stage, by cause of waste and by kind of label.
+"""The cost of labels: seconds and money of a label source, by stage, cause of waste and kind of label.
 
-CPU seconds are measured a shard, not a candidate. So the whole cost of a run, waste included, is divided by
-the number of labels of a kind: candidates that the base does not fit at or the arm does not reach cost next
-to nothing and say next to nothing, and labels within reach carry the cost of all.
+CPU seconds are measured per shard, not per candidate. The whole cost of a run, waste included, is divided by
+the number of labels of a kind. Candidates where the base collides or beyond reach cost almost nothing and
+have almost no information: labels within reach carry the whole cost.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Spent:
 class RunCost:
     """The cost of a run's labels: committed attempts, waste, files that it relabelled, and borrowed scenes.
 
-    A run with --scenes-from labels scenes that another run made. `scenes` is what those cost there: the
+    A run with --scenes-from labels scenes that another run made. `scenes` is their cost in that run: the
     stages draw, settle and observe, rejected tries included, in proportion to the number of scenes; None
     where that run is not among those audited.
     """
@@ -60,12 +60,12 @@ class RunCost:
 
     @property
     def own(self) -> Spent:
-        """What this run itself has spent."""
+        """The cost of this run alone."""
         return self.committed + self.waste
 
     @property
     def total(self) -> Spent:
-        """What its labels take from nothing on; without borrowed scenes where their cost is unknown."""
+        """The whole cost of its labels; without borrowed scenes where their cost is unknown."""
         return self.committed + self.waste + self.relabelled + (self.scenes or Spent())
 
 

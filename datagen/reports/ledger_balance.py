@@ -1,4 +1,4 @@
-"""The sums of a run's ledger against commits plus waste, and the records that break them."""
+"""The sums of a run's ledger compared with commits plus waste, and the records that differ."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _OR_RUNNING = f"{REPAIR}; or audit again where a job is running"
 
 @dataclass(frozen=True)
 class Balance:
-    """Seconds in the ledger, in commits and in waste, and what differs. `ledger_s` = `commits_s` + `waste_s`.
+    """Seconds in ledger, commits and waste, and the difference. `ledger_s` = `commits_s` + `waste_s`.
 
     Keys are "wall" and "cpu". The difference is exactly 0 where every record agrees with its commit, because
-    each number is added once with either sign. A finding's key is the file, below its run.
+    each number is added once with each sign. A finding's key is the file, below its run.
     """
 
     ledger_s: dict[str, float]

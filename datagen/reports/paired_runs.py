@@ -35,7 +35,7 @@ def fidelity(spec: Specification) -> tuple[int, bool]:
     return (_FIDELITY.index(spec.label_source) if known else 0, is_disturbed(spec))
 
 
-def who(run: Run) -> dict[str, Any]:
+def run_record(run: Run) -> dict[str, Any]:
     """Address, label source and disturbance of a run."""
     spec = run.manifest.spec
     return {"run": run.storage.url, "label_source": spec.label_source, "disturbed": is_disturbed(spec)}
@@ -55,15 +55,15 @@ def pairs(runs: Sequence[AuditedRun], candidates: str) -> list[dict[str, Any]]:
     for first, second in combinations(runs, 2):
         if not _labels_same(first.run, second.run) or first.labelled is None or second.labelled is None:
             continue
-        said, true = common_candidates(first.labelled, second.labelled)
+        predicted, true = common_candidates(first.labelled, second.labelled)
         rows = true.is_in(candidates)
-        compared = compare(said.at(rows), true.at(rows))
+        compared = compare(predicted.at(rows), true.at(rows))
         accuracy = compared["accuracy"]
         costs_s = first.wall_s_per_label, second.wall_s_per_label
         found.append(
             {
-                "said_by": who(first.run),
-                "true_by": who(second.run),
+                "said_by": run_record(first.run),
+                "true_by": run_record(second.run),
                 "candidates": candidates,
                 **compared,
                 "wall_s_per_correct_label": {
@@ -78,9 +78,9 @@ def pairs(runs: Sequence[AuditedRun], candidates: str) -> list[dict[str, Any]]:
 def correct_labels(runs: Sequence[AuditedRun], prices: Prices) -> list[dict[str, Any]]:
     """For each run, its cost per correct label; the truth is the run of highest fidelity over its candidates.
 
-    Whole grids and candidates within reach are told apart: the cost of a label of the set is the run's whole
-    cost over the run's labels in it, and a correct label costs that over the accuracy in the set. The truth's
-    own labels count as correct. Runs without another over the same candidates are left out.
+    Whole grids and candidates within reach are separate sets. The cost of a label of a set is the run's whole
+    cost over its labels in the set; a correct label costs that over the accuracy in the set. The truth's own
+    labels count as correct. Runs without another over the same candidates are left out.
     """
     found: list[dict[str, Any]] = []
     for run in runs:
@@ -88,30 +88,30 @@ def correct_labels(runs: Sequence[AuditedRun], prices: Prices) -> list[dict[str,
         labelled = [one for one in same if one.labelled is not None]
         if run.labelled is None or len(labelled) < 2:
             continue
-        # Of several runs of the same fidelity the last, as in `pairs`.
+        # The last of several runs of the same fidelity, as in `pairs`.
         truth = max(reversed(labelled), key=lambda one: fidelity(one.run.manifest.spec))
         assert truth.labelled is not None
-        said, true = common_candidates(run.labelled, truth.labelled)
+        predicted, true = common_candidates(run.labelled, truth.labelled)
         found.append(
-            who(run.run)
-            | {"truth": who(truth.run), "is_truth": truth is run}
-            | {"sets": {name: _correct(run, said, true, name, prices) for name in ("grid", "in-range")}}
+            run_record(run.run)
+            | {"truth": run_record(truth.run), "is_truth": truth is run}
+            | {"sets": {name: _correct(run, predicted, true, name, prices) for name in ("grid", "in-range")}}
         )
     return found
 
 
 def _correct(
-    run: AuditedRun, said: Labelled, true: Labelled, candidates: str, prices: Prices
+    run: AuditedRun, predicted: Labelled, true: Labelled, candidates: str, prices: Prices
 ) -> Mapping[str, Any]:
     assert run.labelled is not None
     rows = true.is_in(candidates)
     group = rows[rows].astype(int) * 0
-    (estimate,) = estimates_by_group(said.label[rows], true.label[rows], true.scene[rows], group, 1)
+    (estimate,) = estimates_by_group(predicted.label[rows], true.label[rows], true.scene[rows], group, 1)
     accuracy, labels = estimate["accuracy"], int(run.labelled.is_in(candidates).sum())
     total, correct = run.cost.total, labels * (accuracy or 0.0)
     return {
         **estimate,
-        "confusion": confusion(said.label[rows], true.label[rows]),
+        "confusion": confusion(predicted.label[rows], true.label[rows]),
         "core_s_per_label": total.core_s / labels if labels else None,
         "core_s_per_correct_label": total.core_s / correct if correct else None,
         "wall_s_per_correct_label": total.wall_s / correct if correct else None,

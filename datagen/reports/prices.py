@@ -70,10 +70,10 @@ def read_prices(path: str | Path | None = None) -> Prices:
 
     Raises InputError for a file that cannot be read, is not TOML, lacks a price or has an odd value.
     """
-    place = DEFAULT_PRICES if path is None else Path(path)
+    file = DEFAULT_PRICES if path is None else Path(path)
     try:
-        return Prices.model_validate(read_toml(place, _FIX))
+        return Prices.model_validate(read_toml(file, _FIX))
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(map(str, first["loc"]))
-        raise InputError(place, field, f"{first['msg']} (given: {str(first['input'])[:80]})", _FIX) from None
+        raise InputError(file, field, f"{first['msg']} (given: {str(first['input'])[:80]})", _FIX) from None

@@ -29,19 +29,19 @@ _BUDGETS: dict[Outcome, int] = {
 }
 
 
-def runs_report(place: Storage, stacks: bool = False) -> dict[str, Any]:
+def runs_report(storage: Storage, stacks: bool = False) -> dict[str, Any]:
     """Return the status of a run, or of merged runs: their sums, and each under `parts`."""
-    runs, root = open_runs(place), sealed_root(place)
+    runs, root = open_runs(storage), sealed_root(storage)
     reports = [status_report(run, root, stacks) for run in runs]
-    return reports[0] if len(reports) == 1 else _sum(place, reports)
+    return reports[0] if len(reports) == 1 else _sum(storage, reports)
 
 
 def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False) -> dict[str, Any]:
     """Return the status of a run. `root` describes the store that holds it, by default its own."""
     summaries, n = Summaries(run), run.n
     planned, committed = ShardRanges.of(range(run.layout.shards_for(n))), ShardRanges.of(summaries.shards)
-    given_up = run.quarantine_records()
-    quarantined = [record.shard for record in given_up]
+    quarantine = run.quarantine_records()
+    quarantined = [record.shard for record in quarantine]
     labels = labels_made = positives = 0
     winners: set[str] = set()
     for commit in summaries.commits():
@@ -102,7 +102,7 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
                 "attempts": len(record.attempts),
                 "cause": record.causes[-1] if record.causes else "",
             }
-            for record in given_up
+            for record in quarantine
         ],
         "taken_out_of_quarantine": len(lifted_records(run)),
         "lineage": lineage_summary(run),
@@ -122,9 +122,9 @@ def _sealed_labels(run: Run, part: SealedPart) -> int:
     return part.n - sum(run.layout.rows_wanted(shard, part.n)[1] for shard in part.missing_shards)
 
 
-def _sum(place: Storage, parts: list[dict[str, Any]]) -> dict[str, Any]:
+def _sum(storage: Storage, parts: list[dict[str, Any]]) -> dict[str, Any]:
     total: dict[str, Any] = {
-        "run": place.url,
+        "run": storage.url,
         "label_source": parts[0]["label_source"],
         "spec_hash": "",
         "made_from": "; ".join(dict.fromkeys(part["made_from"] for part in parts)),
@@ -142,8 +142,8 @@ def _sum(place: Storage, parts: list[dict[str, Any]]) -> dict[str, Any]:
     shards = [part["shards"] for part in parts]
     counted = {key: sum(s[key] for s in shards) for key in ("planned", "committed", "missing")}
     # A shard's number is ambiguous without its part.
-    given_up = [f"{number}:{shard}" for number, s in enumerate(shards) for shard in s["quarantined"]]
-    total["shards"] = counted | {"quarantined": given_up}
+    quarantined = [f"{number}:{shard}" for number, s in enumerate(shards) for shard in s["quarantined"]]
+    total["shards"] = counted | {"quarantined": quarantined}
     total["quarantine"] = [
         q | {"shard": f"{number}:{q['shard']}"}
         for number, part in enumerate(parts)

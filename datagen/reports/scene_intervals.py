@@ -39,7 +39,7 @@ METRICS: dict[str, Callable[[F64], F64]] = {
 
 
 def estimates_by_group(
-    said: Bools, true: Bools, scene: npt.NDArray[np.integer[Any]], group: Ints, n_groups: int
+    predicted: Bools, true: Bools, scene: npt.NDArray[np.integer[Any]], group: Ints, n_groups: int
 ) -> list[dict[str, Any]]:
     """For each group: count, scenes, and each of METRICS with its interval (`accuracy_interval`).
 
@@ -48,7 +48,7 @@ def estimates_by_group(
     """
     _, scene_row = np.unique(scene, return_inverse=True)
     n_scenes = int(scene_row.max(initial=-1)) + 1
-    cells = confusion(said.astype(np.float64), true, scene_row * n_groups + group, n_scenes * n_groups)
+    cells = confusion(predicted.astype(np.float64), true, scene_row * n_groups + group, n_scenes * n_groups)
     per_scene = cells.reshape(n_scenes, n_groups, 4)
     resampled = _resampled(per_scene)
     whole, scenes = per_scene.sum(axis=0), (per_scene.sum(axis=2) > 0).sum(axis=0)
@@ -83,7 +83,7 @@ def _estimates(whole: F64, resampled: F64, scenes: int) -> dict[str, Any]:
 
 
 def finite(value: float) -> float | None:
-    """The number; None where it is nan or infinite, which JSON has not."""
+    """The number; None where it is nan or infinite, which JSON does not have."""
     return value if math.isfinite(value) else None
 
 

@@ -39,7 +39,7 @@ def in_edge_frame(base_xy_m: npt.NDArray[Any], target_xy_m: F64, towards_edge: F
 
 
 def side_of(xy_m: F64) -> npt.NDArray[np.intp]:
-    """Index (N,) into SIDES of positions (N, 2) in the edge frame: quarters, 45 degrees to either hand."""
+    """Index (N,) into SIDES of positions (N, 2) in the edge frame: quarters, 45 degrees to either side."""
     x, y = xy_m.T
     across = np.abs(y) >= np.abs(x)
     return np.where(across, np.where(y <= 0, 0, 3), np.where(x < 0, 1, 2))

@@ -1,4 +1,4 @@
-"""A pandas table with one row a candidate, joined with its scene."""
+"""A pandas table with one row per candidate, joined with its scene."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Array = npt.NDArray[Any]
 
 
 class _Rows:
-    """One shard's columns by the names of the table, a row a candidate."""
+    """One shard's columns by the names of the table, one row per candidate."""
 
     def __init__(
         self, part: RunPart, shard: ShardPlace, columns: Columns, scene: npt.NDArray[np.int64]
@@ -33,7 +33,7 @@ class _Rows:
         return len(self._scene)
 
     def stored(self, name: str) -> Array:
-        """A stored array; of a scene's, each value as often as the scene has candidates."""
+        """A stored array; values of a scene are repeated for each of its candidates."""
         values = self._columns[name]
         return values[self._scene] if self._part.arrays[name].dims[0] == "scene" else values
 
@@ -48,7 +48,7 @@ class _Rows:
         houses = self._columns["house_id"]
         return np.array([split_of(str(house)) for house in houses], object)[self._scene]
 
-    def place(self) -> Array:
+    def run(self) -> Array:
         return self.one(self._part.place)
 
     def cost(self) -> Array:
@@ -60,7 +60,7 @@ class _Rows:
 
 # Columns that are not arrays of the store: the arrays that each is made from, and how.
 _DERIVED: Mapping[str, tuple[tuple[str, ...], Callable[[_Rows], Array]]] = {
-    "run": ((), _Rows.place),
+    "run": ((), _Rows.run),
     "house": (("house_id",), lambda rows: rows.stored("house_id")),
     "split": (("house_id",), _Rows.split),
     "object": (("object_name",), lambda rows: rows.stored("object_name")[:, 0]),
@@ -95,19 +95,19 @@ _DEFAULT = (
 def candidates(
     *paths: str | Path, columns: Sequence[str] | None = None, allow_incomplete: bool = False
 ) -> pandas.DataFrame:
-    """Return a pandas table with one row a candidate base pose, joined with its scene.
+    """Return a pandas table with one row per candidate base pose, joined with its scene.
 
-    The base stands at `base_x_world_m`, `base_y_world_m` in the frame of the house (z up, floor at 0) and
+    The base is at `base_x_world_m`, `base_y_world_m` in the frame of the house (z up, floor at 0) and
     faces the target: `base_yaw_world_rad`, counter-clockwise from x. `base_x_target_m` and
     `base_y_target_m` are along the same axes, from the target's centre. `cost_s` is the wall-clock time
-    of the candidate's shard divided by its candidates (not known of a sealed store without its run).
-    `robot` is empty where labels are of no particular arm. `split` is the side of the train, val, test
-    split that the house belongs to. Texts are categories. What a run does not store is missing there.
+    of the candidate's shard divided by its candidates (unknown for a sealed store without its run).
+    `robot` is empty where labels have no particular arm. `split` is the side of the train, val, test
+    split that the house belongs to. Texts are categories. Values that a run does not store are missing.
 
     Args:
         paths: Folders or `s3://` addresses of runs, merged runs or sealed `data.zarr` stores.
         columns: Columns to read: any of the default ones, `sample_id`, and every array of one number or
-            text a scene or candidate in docs/reference/data-format.md. Fewer columns are faster.
+            text per scene or candidate in docs/reference/data-format.md. Fewer columns are faster.
         allow_incomplete: Read runs that lack a part of their labels, instead of failing.
 
     Raises:

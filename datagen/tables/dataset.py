@@ -18,7 +18,7 @@ from datagen.tables.stored_fields import fields_of, refuse_unknown
 from datagen.train.run_parts import RunPart, open_parts, refuse_twins
 
 _Shard = tuple[ShardPlace, StoredArray]
-# Scene and sample dimension of the stores; samples are candidates to those who use them.
+# Dimension of the stores -> of the Dataset, where samples are named candidates.
 _DIMS = {"scene": "scene", "sample": "candidate"}
 _COORDINATES = ("scene_index", "house_id", "candidate_index", "robot_index")
 
@@ -37,7 +37,7 @@ def open_dataset(
 
     Args:
         paths: Folders or `s3://` addresses of runs, merged runs or sealed `data.zarr` stores.
-        columns: Arrays to open; all that every one of these runs stores if not given.
+        columns: Arrays to open; if not given, all that every one of these runs stores.
         allow_incomplete: Open runs that lack a part of their labels, instead of failing.
 
     Raises:
@@ -75,22 +75,22 @@ def _variable(shards: Sequence[_Shard], table: Table, field: Any) -> xarray.Vari
 
 
 def _rows(parts: Sequence[RunPart]) -> dict[str, xarray.Variable]:
-    """Which scene each candidate belongs to, and which path each scene; known without reading."""
+    """The coordinates `scene_row` and `run`, which need no array to be read."""
     rows, runs, first = [np.zeros(0, np.int64)], list[str](), 0
     for part in parts:
         for shard in part.shards:
             rows.append(first + np.arange(shard.samples) // (shard.full_samples // shard.full_scenes))
             first += shard.scenes
             runs += [part.place] * shard.scenes
-    told = {"long_name": "row of the candidate's scene along the dimension scene", "units": "1"}
+    attributes = {"long_name": "row of the candidate's scene along the dimension scene", "units": "1"}
     return {
-        "scene_row": xarray.Variable("candidate", np.concatenate(rows), told),
+        "scene_row": xarray.Variable("candidate", np.concatenate(rows), attributes),
         "run": xarray.Variable("scene", np.array(runs, object), {"long_name": "run that the scene lies in"}),
     }
 
 
 class _ShardedArray(BackendArray):
-    """An array over all shards, of which the shards that an index touches are read."""
+    """An array over all shards; an index reads only the shards that it touches."""
 
     def __init__(self, shards: Sequence[_Shard]) -> None:
         first = shards[0][1]

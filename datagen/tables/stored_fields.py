@@ -1,4 +1,4 @@
-"""Which arrays the runs at given paths store, known before any array is opened."""
+"""The arrays that the runs at given paths store, known before any array is opened."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _fields_of(path: str | Path) -> dict[str, tuple[Table, Field]]:
 
 
 def refuse_unknown(names: Sequence[str], valid: Sequence[str], place: str) -> None:
-    """InputError that lists the valid names where one is none of them."""
+    """Raise InputError, with the valid names, for a name that is not one of them."""
     for name in names:
         if name not in valid:
             raise InputError(place, f"columns: {name}", "is not a column of these runs", choices(valid))

@@ -128,7 +128,8 @@ def test_odd_calls_are_refused(
     judged = ["--val", str(runs / "val"), "--test", str(runs / "test"), "--out", out]
     refused(["frontier", str(runs / "heuristic"), *judged], capfd, "all have heuristic labels")
     swapped = ["--val", str(heuristic_run), "--test", str(runs / "test"), "--out", out]
-    refused(["frontier", str(runs / "train"), *swapped], capfd, "is heuristic, which no model is judged by")
+    message = "is heuristic: models are judged on plan or sim labels"
+    refused(["frontier", str(runs / "train"), *swapped], capfd, message)
     same = ["--val", str(runs / "val"), "--test", str(runs / "train"), "--out", out]
     refused(["frontier", str(runs / "train"), *same], capfd, "house")
     assert not Path(out).exists()

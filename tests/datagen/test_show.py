@@ -95,7 +95,7 @@ def test_a_candidate_tried_again_ends_as_it_is_stored(name: str, runs: dict[str,
             assert (again.result is None) == (rows.samples["attempts"][row] == 0)
         recording = again.recording
         assert recording.T_world_object.shape == (len(recording.phase), len(scene.models), 4, 4)
-        moments = [moment for moment, _ in again.told]
+        moments = [moment for moment, _ in again.moments]
         assert moments[0] == 0 and moments[-1] == len(recording.phase) - 1
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from datagen.drawing.film import Film, pictures, told_moments
+from datagen.drawing.film import Film, filmstrip_moments, pictures
 from datagen.drawing.filmstrip import Title, write_motion, write_sheet
 from datagen.drawing.posed_robot import RobotBodies, robot_bodies
 from datagen.workers.rendering.embree_renderer import cast_pixels
@@ -41,24 +41,24 @@ def recording(scene: ReconstructedScene, bodies: RobotBodies) -> Recording:
 
 @pytest.fixture(scope="module")
 def film(scene: ReconstructedScene, bodies: RobotBodies, recording: Recording) -> Film:
-    told = told_moments(recording)
-    return Film(scene, bodies, base_pose(), recording, told, *SIZES)
+    moments = filmstrip_moments(recording)
+    return Film(scene, bodies, base_pose(), recording, moments, *SIZES)
 
 
 def test_eight_moments_tell_a_trial(recording: Recording) -> None:
-    told = told_moments(recording)
-    assert [recording.phase[row] for row, _ in told] == [
+    moments = filmstrip_moments(recording)
+    assert [recording.phase[row] for row, _ in moments] == [
         "reach", "reach", "reach", "approach", "close", "lift", "lift", "hold",
     ]  # fmt: skip
-    assert told[0][0] == 0 and told[-1][0] == len(recording.phase) - 1
+    assert moments[0][0] == 0 and moments[-1][0] == len(recording.phase) - 1
 
 
 @pytest.mark.parametrize("rows", [1, 2, 5, 8, 13, 20])
 def test_a_trial_that_ended_early_is_told_to_its_end(recording: Recording, rows: int) -> None:
-    told = told_moments(cut(recording, rows))
-    moments = [row for row, _ in told]
-    assert len(told) == min(rows, 8) and moments == sorted(set(moments))
-    assert moments[0] == 0 and moments[-1] == rows - 1
+    moments = filmstrip_moments(cut(recording, rows))
+    shown = [row for row, _ in moments]
+    assert len(moments) == min(rows, 8) and shown == sorted(set(shown))
+    assert shown[0] == 0 and shown[-1] == rows - 1
 
 
 def test_the_fingers_stand_as_far_apart_as_the_hand_is_open(bodies: RobotBodies) -> None:
@@ -84,7 +84,7 @@ def test_the_robot_stands_on_the_floor(bodies: RobotBodies) -> None:
 
 
 def test_both_views_show_target_and_hand(film: Film, bodies: RobotBodies) -> None:
-    row = next(row for row, words in film.told if words == "at the grasp")
+    row = next(row for row, words in film.moments if words == "at the grasp")
     stage = film.stage(row)
     for shot in film.shots:
         full = RayScene(shot.house, stage.objects, stage.radii_m, stage.T_world_object)
@@ -114,7 +114,7 @@ def test_walls_before_the_camera_are_left_out(bodies: RobotBodies) -> None:
     ]
     scene = recalled(table_house(closet))
     recording = recording_of(bodies.robot, scene, base_pose())
-    film = Film(scene, bodies, base_pose(), recording, told_moments(recording), (96, 72), (96, 72))
+    film = Film(scene, bodies, base_pose(), recording, filmstrip_moments(recording), (96, 72), (96, 72))
     eye_m = film.shots[0].camera.T_world_camera[:2, 3]
     assert np.abs(eye_m - (cx, cy)).max() > 1.1  # outside
     stage = film.stage(len(recording.phase) - 1)
@@ -144,7 +144,7 @@ def test_a_sheet_of_one_pose(
     scene: ReconstructedScene, bodies: RobotBodies, recording: Recording, tmp_path: Path
 ) -> None:
     still = cut(recording, 1)
-    film = Film(scene, bodies, base_pose(), still, told_moments(still), *SIZES)
+    film = Film(scene, bodies, base_pose(), still, filmstrip_moments(still), *SIZES)
     write_sheet(film, TITLE, tmp_path / "one.png")
     with Image.open(tmp_path / "one.png") as image:
         assert image.size[0] == 10 + 2 * (SIZES[0][0] + 10)
@@ -153,8 +153,8 @@ def test_a_sheet_of_one_pose(
 def test_a_film_moves(
     scene: ReconstructedScene, bodies: RobotBodies, recording: Recording, tmp_path: Path
 ) -> None:
-    told = told_moments(recording)
-    film = Film(scene, bodies, base_pose(), recording, told, *SIZES)
+    moments = filmstrip_moments(recording)
+    film = Film(scene, bodies, base_pose(), recording, moments, *SIZES)
     out = tmp_path / "film.gif"
     write_motion(film, TITLE, out)
     with Image.open(out) as image:

@@ -178,7 +178,7 @@ def test_merged_runs_sealed_stores_and_runs_on_s3(reported: Path, bucket: str, t
     headings = re.findall(r'<h2 id="[^"]*">([^<]*)', page.source)
     assert len(headings) == 4 and sum("parts/" in heading for heading in headings) == 2
     assert "sealed store without its run" in page.text and "30 labels by heuristic" in page.text
-    assert "2 shards: too few to tell which stand out" in page.text
+    assert "2 shards: too few to find outliers" in page.text
 
 
 def test_a_run_without_labels_shows_its_failures(tmp_path: Path) -> None:
