@@ -1,10 +1,10 @@
-"""How rules that look at distance and sight alone agree with a run of `plan` or `sim`, as tables.
+"""How rules that use distance and visibility alone agree with a run of `plan` or `sim`, as tables.
 
     python -m benchmarks.agreement RUN
 
-Rules are computed anew from the stored columns: the paper's heuristic with its absolute distance, the
+Rules are computed from the stored columns: the paper's heuristic with its absolute distance, the
 same with the distance from mount to target divided by the arm's reach, "within reach", and both
-joined. None of them knows whether the base fits where it would stand; "and clear" adds that.
+joined. None of them checks whether the base fits; "and clear" adds that check.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from datagen.schemas.specification import HeuristicParams
 from datagen.workers.bases.candidate_sets import CANDIDATE_SETS, Bools
 from datagen.workers.labels.distance_visibility_score import heuristic
 
-# Distances in reaches of the arm: nothing beyond one can be grasped.
+# Distances in units of the arm's reach: nothing beyond 1 can be grasped.
 OVER_REACH = HeuristicParams(
     distance="mount-over-reach", mu=0.7, sigma_l=0.3, sigma_r=0.15, d_min=0.0, d_max=1.0
 )
@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def rules_of(labelled: Labelled) -> Mapping[str, Bools]:
-    """What each rule says of every candidate (N,)."""
+    """Predictions (N,) of each rule."""
 
     def by(params: HeuristicParams) -> Bools:
         distances = (labelled.distance_m, labelled.mount_distance_m)
@@ -61,7 +61,7 @@ def rules_of(labelled: Labelled) -> Mapping[str, Bools]:
 
 
 def print_set(labelled: Labelled, rules: Mapping[str, Bools], name: str) -> None:
-    """One set of candidates: a row a rule; where bases may collide, a second row with the clear ones."""
+    """Print a row per rule for one candidate set; where bases may collide, a second row with "and clear"."""
     rows = labelled.is_in(name)
     label = labelled.label[rows]
     if not len(label):
@@ -69,20 +69,20 @@ def print_set(labelled: Labelled, rules: Mapping[str, Bools], name: str) -> None
         return
     print(f"\n{name}: {len(label):,} candidates, {100 * label.mean():.1f}% positive")
     print(f"{'rule':42}{'says good':>11}{'accuracy':>10}{'balanced':>10}{'found':>8}{'wrong':>8}")
-    for rule, said in rules.items():
-        print_rule(rule, said[rows], label)
-        if name == "grid" and said.any():
-            print_rule(f"{rule}, and clear", (said & labelled.is_clear)[rows], label)
+    for rule, predicted in rules.items():
+        print_rule(rule, predicted[rows], label)
+        if name == "grid" and predicted.any():
+            print_rule(f"{rule}, and clear", (predicted & labelled.is_clear)[rows], label)
 
 
-def print_rule(rule: str, said: Bools, label: Bools) -> None:
-    """`found`: share of the positives it names; `wrong`: share of what it names that is not."""
-    told, counts = agreement(said, label), confusion(said, label)
-    balanced = told["balanced_accuracy"]
-    named, good = int(said.sum()), int(label.sum())
+def print_rule(rule: str, predicted: Bools, label: Bools) -> None:
+    """Print a row. `found`: share of positives predicted; `wrong`: share of predictions that are negative."""
+    scores, counts = agreement(predicted, label), confusion(predicted, label)
+    balanced = scores["balanced_accuracy"]
+    named, good = int(predicted.sum()), int(label.sum())
     cells = (
-        f"{100 * said.mean():10.1f}%",
-        f"{100 * told['accuracy']:9.1f}%",
+        f"{100 * predicted.mean():10.1f}%",
+        f"{100 * scores['accuracy']:9.1f}%",
         "         -" if balanced is None else f"{100 * balanced:9.1f}%",
         f"{100 * counts['true_positive'] / good:7.1f}%" if good else "       -",
         f"{100 * counts['false_positive'] / named:7.1f}%" if named else "       -",

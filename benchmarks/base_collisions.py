@@ -1,8 +1,8 @@
-"""Why bases do not fit: the candidates of a run whose outcome is `base_collision`, taken apart.
+"""Why bases do not fit: the candidates of a run with outcome `base_collision`, by cause.
 
     python -m benchmarks.base_collisions RUN [--scenes 20]
 
-Each counts once, under the first that applies: outside all rooms; in another room than the target's;
+Each counts once, under the first cause that applies: outside all rooms; in another room than the target's;
 with its middle in a wall, in the furniture that carries the target, or in other furniture; or with
 its middle on free floor, but nearer than the base's radius to one of these. A second table says how many
 would fit, and how many of these within reach, were the base narrower.
@@ -62,11 +62,11 @@ def main() -> None:
 
 
 def causes(house: House, record: Mapping[str, Any], samples: Mapping[str, np.ndarray[Any, Any]]) -> list[str]:
-    """What stands in the way of each candidate; "clear" where nothing does."""
+    """The cause of each candidate's collision; "clear" where the base fits."""
     xy = samples["base_xy_m"].astype(np.float64)
     room = house.room(str(record["room_id"]))
     indoors = inside_any(xy, [r.polygon_m for r in house.rooms])
-    beside = inside_any(xy, [room.polygon_m])
+    is_in_room = inside_any(xy, [room.polygon_m])
     depth_m = np.stack([gaps(house, str(record["support_id"]), kind, xy, samples) for kind in _IN_THE_WAY])
     found: list[str] = []
     for k, fits in enumerate(samples["base_clearance_m"] >= 0):
@@ -75,7 +75,7 @@ def causes(house: House, record: Mapping[str, Any], samples: Mapping[str, np.nda
             found.append("clear")
         elif not indoors[k]:
             found.append("outside all rooms")
-        elif not beside[k]:
+        elif not is_in_room[k]:
             found.append("in another room")
         elif depth_m[:, k].min() < 0:
             found.append(f"middle in {nearest}")

@@ -1,11 +1,11 @@
-"""What execution adds: the same candidates as planned, executed as planned, and in disturbed worlds.
+"""The effect of execution: the same candidates planned, executed as planned, and in disturbed worlds.
 
     datagen submit sim --n 300 --candidates in-range --candidates-per-scene 15 ... --out CALM
     datagen submit sim --n 300 --scenes-from CALM --perturb 5 --out DISTURBED
     python -m benchmarks.disturbed CALM DISTURBED
 
 Prints successes, labels that change, the entropy of the label among planned candidates, how the
-success rate goes with the grasp's score and with distance over reach, and what ends the repeats.
+success rate depends on the grasp's score and on distance over reach, and the causes of failure.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def main() -> None:
     options = parser.parse_args()
     calm, disturbed = columns_of(options.calm), columns_of(options.disturbed)
     shared = min(len(calm["outcome"]), len(disturbed["outcome"]))  # one run may be longer
-    calm, disturbed = ({name: v[:shared] for name, v in said.items()} for said in (calm, disturbed))
+    calm, disturbed = ({name: v[:shared] for name, v in run.items()} for run in (calm, disturbed))
     for name in ("sample_scene_index", "candidate_index"):
         if not np.array_equal(calm[name], disturbed[name]):
             parser.error("the runs do not hold the same candidates: make one with --scenes-from the other")
@@ -73,27 +73,27 @@ def main() -> None:
     share = (disturbed["mount_distance_m"] / disturbed["arm_reach_m"])[planned]
     print_rate("distance / reach", share, rate[planned], SHARE_EDGES)
     print("\nlabel 0, by cause, of the planned")
-    for name, said in (("calm", calm), ("disturbed", disturbed)):
-        ends = Counter(_NAMES[code] for code in said["outcome"][planned] if code)
+    for name, columns in (("calm", calm), ("disturbed", disturbed)):
+        ends = Counter(_NAMES[code] for code in columns["outcome"][planned] if code)
         print(f"{name:12}" + (", ".join(f"{cause} {n}" for cause, n in ends.most_common()) or "none"))
 
 
 def columns_of(run: Path) -> Columns:
-    """What the tables need of a run, (N,) each."""
+    """Columns of a run that the tables need, (N,) each."""
     store = zarr.open_group(str(run / SEALED), mode="r")
     return {name: np.asarray(store[name]) for name in COLUMNS}
 
 
-def entropy(said: np.ndarray[Any, Any]) -> float:
+def entropy(good: np.ndarray[Any, Any]) -> float:
     """Bits that one label carries: 1 where half are good, 0 where all are alike."""
-    share = float(said.mean())
+    share = float(good.mean())
     return float(sum(-p * np.log2(p) for p in (share, 1 - share) if p > 0))
 
 
 def over_chance(disturbed: Columns, planned: np.ndarray[Any, Any]) -> float:
     """Variance of successes among the repeats over that of a binomial with one rate for all.
 
-    1 where it does not matter which candidate it is, and up to the number of repeats where nothing else does.
+    1 where all candidates have one rate, and up to the number of repeats where the candidate alone decides.
     """
     successes, repeats = disturbed["successes"][planned], int(disturbed["trials"].max())
     rate = float(successes.mean()) / repeats

@@ -1,4 +1,4 @@
-"""What the driver costs per shard: a simulated cluster for the loop, a real folder for the ledger.
+"""Cost of the driver per shard: a simulated cluster for the loop, a real folder for the ledger.
 
 python -m benchmarks.driver [--shards 1000000] [--nodes 64] [--ledger 2000] [--ray 1000]
 """
@@ -30,7 +30,7 @@ from tests.made_runs import make_run
 def loop(shards: int, nodes: int) -> tuple[JobSummary, float, float]:
     """A bad cluster driven to its end: (summary, CPU milliseconds per shard, growth of peak memory in MiB).
 
-    The milliseconds hold the simulator's own. It checks the result against its own count, shard by shard.
+    The milliseconds include the simulator's. It checks the result against its own count, shard by shard.
     """
     before, start_s = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
     summary, _ = simulate(shards, seed=1, nodes=nodes)
@@ -53,7 +53,7 @@ def ledger(entries: int) -> float:
 
 
 def nothing(task: ScriptedTask, meter: Meter) -> AttemptResult:
-    """The shortest shard there is."""
+    """An empty shard."""
     return AttemptResult(True, 1, 0, meter.cost())
 
 
@@ -93,7 +93,7 @@ def main() -> None:
     ends = {
         "committed": totals.committed,
         "committed by lost workers": totals.superseded + totals.elsewhere,
-        "given up": totals.quarantined,
+        "quarantined": totals.quarantined,
         "attempts": sum(totals.outcomes.values()),
     } | {f"attempts {outcome}": totals.outcomes[outcome] for outcome in sorted(totals.outcomes)}
     for name, number in ends.items():

@@ -1,4 +1,4 @@
-"""What a model's errors are made of: one input at a time is replaced by what is true in the scene.
+"""Causes of a model's errors: one input at a time is replaced by its true value in the scene.
 
     python -m benchmarks.error_shares TRAIN --val VAL --test TEST --houses procthor:DIR --objects ycb:DIR
         --test-objects ycb:DIR --out FOLDER [--scenes 1000] [--epochs 8] [--seeds 1]
@@ -12,9 +12,9 @@ and judged on TEST
 - with both
 - with half and a quarter of the scenes, in as many epochs and so in fewer steps; and without hand poses
 
-Printed are balanced accuracy and AUC with 95% intervals over scenes, and their differences from the first
-row. Inputs are kept in FOLDER and not made again. What remains beside the rows with true inputs is the
-kinematics that the model has to learn, and the noise of labels (`benchmarks.repeatability`).
+Prints balanced accuracy and AUC with 95% intervals over scenes, and their differences from the first row.
+Inputs in FOLDER are used again. Errors that remain with true inputs come from the kinematics that the model
+has to learn, and from the noise of labels (`benchmarks.repeatability`).
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _OPENING = 2  # of the measures, in units of 0.1 m
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Encoded scenes with what is true of them."""
+    """Encoded scenes with their true visibility and grasps."""
 
     estimated: EncodedRuns
     visibility: F32  # (N,)
@@ -74,14 +74,12 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     out = Path(given.out)
-    places = (
+    runs = (
         ("train", given.train, given.objects, given.scenes),
         ("val", given.val, given.objects, None),
         ("test", given.test, given.test_objects, None),
     )
-    data = {
-        name: inputs_of(place, given.houses, objects, scenes, out) for name, place, objects, scenes in places
-    }
+    data = {name: inputs_of(path, given.houses, objects, scenes, out) for name, path, objects, scenes in runs}
     seeds = range(given.seeds)
     both = ("visible_share", "hand_poses")
     rows: dict[str, F64] = {}
@@ -96,11 +94,11 @@ def main() -> None:
     show(rows, test.label == 1, test.scene_of_candidate)
 
 
-def inputs_of(place: str, houses: str, objects: str, scenes: int | None, out: Path) -> Inputs:
-    """The inputs of a run's first scenes, made in `out` where they are not there yet."""
+def inputs_of(path: str, houses: str, objects: str, scenes: int | None, out: Path) -> Inputs:
+    """The inputs of a run's first scenes, made in `out` if they are not there yet."""
     with counting("scenes encoded", False) as seen:
-        encoded = encode_runs(encoded_stream([place], False), SharedModel({}), out, seen)
-    run = Run.open(place)
+        encoded = encode_runs(encoded_stream([path], False), SharedModel({}), out, seen)
+    run = Run.open(path)
     count = len(encoded.houses) if scenes is None else scenes
     kept = out / f"{encoded.key}-{count}.npz"
     if not kept.exists():
@@ -143,7 +141,7 @@ def _true_inputs(
         grasps[row, : len(kept), _OPENING] = 10 * around.opening_m[kept]
         grasps[row, :, 1] = np.log1p(len(around.kept))
         grasps[row, : len(kept), N_MEASURES:] = axes.reshape(len(kept), 9)
-        # As batches have them: by robot, in stored order.
+        # In the order of batches: by robot, then as stored.
         order = np.argsort(stored.samples["robot_index"], kind="stable")
         visibility.append(stored.samples["visibility"][order].astype(np.float32))
         seen(row + 1, count)

@@ -1,4 +1,4 @@
-"""Estimates from mixed labels against the truth of whole runs: coverage of intervals, and how much narrower.
+"""Estimates from mixed labels against the truth of whole runs: bias, coverage and width of intervals.
 
     python -m benchmarks.estimation CHEAP --with DEAR [--scenes 400] [--dear 25 50 100] [--draws 400]
 

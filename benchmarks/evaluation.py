@@ -1,8 +1,8 @@
-"""How long tables and intervals take once candidates are scored, and the memory that they need, as a table.
+"""Time and memory of tables and intervals over scored candidates, as a table.
 
     python -m benchmarks.evaluation [--scenes 1000] [--per-scene 625] [--methods 10] [--bootstrap 1000]
 
-Scores and labels are random: their number alone decides.
+Scores and labels are random: only their number matters.
 """
 
 from __future__ import annotations

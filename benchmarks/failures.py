@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from benchmarks.repeatability import stored_scenes
-from datagen.drawing.film import Film, Lens, told_moments
+from datagen.drawing.film import Film, Lens, filmstrip_moments
 from datagen.drawing.posed_robot import robot_bodies
 from datagen.schemas.cost import StageClock
 from datagen.schemas.outcomes import OUTCOMES
@@ -83,8 +83,8 @@ def strip(
     recording = trial.results[0].recording
     assert recording is not None
     bodies = robot_bodies(at.robot, spec.candidates.base_radius_m)
-    told = told_moments(recording)
-    film = Film(cast(Any, scene), bodies, trial.T_world_base[0], recording, told, _VIEW_PX, _VIEW_PX)
+    shown = filmstrip_moments(recording)
+    film = Film(cast(Any, scene), bodies, trial.T_world_base[0], recording, shown, _VIEW_PX, _VIEW_PX)
     phase, last = np.array(recording.phase), len(recording.phase) - 1
     grasp, closed = (int(np.flatnonzero(phase == name)[-1]) for name in ("approach", "close"))
     lens = Lens(film.shots[1], 2, outlined=False)

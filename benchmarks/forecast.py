@@ -1,7 +1,7 @@
 """How often the 80 % intervals of `datagen submit --dry-run` hold, over small runs of mixed specifications.
 
 Each run is forecast from a pilot in a new process and then made in another one. CPU seconds and bytes are
-those of its commits. Wall time depends on what else the machine does: the load is printed too.
+those of its commits. Wall time depends on the load of the machine, which is printed too.
 
     python -m benchmarks.forecast --assets DIR --out build/forecast [--runs 30] [--first 0]
 """
@@ -50,7 +50,7 @@ def arguments(number: int, assets: Path) -> list[str]:
 
 
 def called(*words: str) -> str:
-    """What the command prints."""
+    """Output of the command. Exits with its errors where it fails."""
     done = subprocess.run(
         [sys.executable, "-m", "datagen.cli", *words], capture_output=True, text=True, check=False
     )

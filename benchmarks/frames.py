@@ -4,8 +4,8 @@
 
 Scenes of the test houses as runs draw them, each frame once exact and once with the stereo noise of
 `workers/rendering/noise.py`, depth in whole millimetres. Centre: error of the estimate from the true mask.
-Click: overlap (intersection over union) with the true mask of what grows from the target's middle pixel.
-Floor: tilt, and the error in the target's height, where it is found from the picture and the camera's height;
+Click: overlap (intersection over union) of the region grown from the target's middle pixel and the true mask.
+Floor: tilt, and the error in the target's height, where it is found from the image and the camera's height;
 wrong where these are above 3 degrees or 40 mm.
 """
 
@@ -34,7 +34,7 @@ from datagen.workers.world import assemble_world
 
 
 def main() -> None:
-    """Draw the scenes and print what was found."""
+    """Draw the scenes and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--scenes", type=int, default=80)
     parser.add_argument("--houses", default="builtin")
@@ -59,11 +59,11 @@ def main() -> None:
         print(f"  click: overlap {np.median(overlap):.2f} in the median, 10 % below", end=" ")
         print(f"{np.percentile(overlap, 10):.2f}; above 0.7 in {(overlap > 0.7).sum()}")
         tilts = np.array([row[2] for row in found if row[2] is not None])
-        there = np.array([row[3] for row in found])
+        floor = np.array([row[3] for row in found])
         missed = sum(row[2] is None and row[3] for row in found)
         wrong = sum(row[2] is not None and (row[2][0] > 3 or row[2][1] > 40) for row in found)
         print(
-            f"  floor: in {there.sum()} frames; found in {len(tilts)}, missed in {missed}, wrong in {wrong};",
+            f"  floor: in {floor.sum()} frames; found in {len(tilts)}, missed in {missed}, wrong in {wrong};",
             end=" ",
         )
         print(
@@ -120,16 +120,16 @@ def _floor(scene: Scene, frame: SensorFrame) -> tuple[F64 | None, bool]:
     """(tilt in degrees and error of the target's height in mm) or None; whether a floor is in sight."""
     true = scene.camera.T_world_camera
     world = frame.points_m @ true[:3, :3].T + true[:3, 3]
-    there = bool(floor_points(world, true[:3, 3]).mean() > 0.03)
+    has_floor = bool(floor_points(world, true[:3, 3]).mean() > 0.03)
     unposed = SensorFrame(frame.place, frame.points_m, frame.rgb, frame.on_target, None, frame.image)
     try:
         found = find_ground(unposed, float(true[2, 3]), None).T_world_camera
     except InputError:
-        return None, there
+        return None, has_floor
     tilt = np.degrees(np.arccos(min(1.0, float(found[2, :3] @ true[2, :3]))))
     centre = np.append(scene.target_center_m, 1.0)
     height = (found @ np.linalg.inv(true) @ centre)[2]
-    return np.array([tilt, 1000 * abs(height - centre[2])]), there
+    return np.array([tilt, 1000 * abs(height - centre[2])]), has_floor
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@
 - tokens: `datagen frontier`, small models from cached tokens
 - frozen: the pooled features of the stage-1 model of "tokens", and a new head trained on them
 
-The last two have the same houses; "full" has as many others. Trainings are kept in FOLDER and not made again.
+The last two have the same houses; "full" has as many others. Finished trainings in FOLDER are used again.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     out = Path(options.out)
-    places = {"heuristic": options.heuristic, "plan": options.plan, "val": options.val, "test": options.test}
+    paths = {"heuristic": options.heuristic, "plan": options.plan, "val": options.val, "test": options.test}
     data = {
         name: encode_runs(
-            encoded_stream([place], False), SharedModel(MODEL_CONFIG), out / "encodings", lambda *_: None
+            encoded_stream([path], False), SharedModel(MODEL_CONFIG), out / "encodings", lambda *_: None
         )
-        for name, place in places.items()
+        for name, path in paths.items()
     }
     share: float = options.stage1_share
     first = Stage("heuristic", share)
@@ -64,7 +64,7 @@ def main() -> None:
     folders = {name: str(out / "encodings" / encoded.key) for name, encoded in data.items()}
     tasks = [TrainingTask(mixture, 0, folders, str(out)) for mixture in mixtures]
     rows: dict[str, list[Row]] = {"full": [], "tokens": [], "frozen": []}
-    rows["full"] = [_full(mixture, places, out, data["test"]) for mixture in mixtures]
+    rows["full"] = [_full(mixture, paths, out, data["test"]) for mixture in mixtures]
     assert make_trainings(tasks, 1, lambda: False, lambda *_: None)
     stage1 = SharedModel(MODEL_CONFIG)
     stage1.load_state_dict(_weights(tasks[0].path))
@@ -91,12 +91,12 @@ def _shown(row: Row) -> str:
 
 
 def _judged(label: Any, scores: F32) -> tuple[float, float]:
-    said = (scores >= 0.5).astype(np.float64)
-    counts = confusion(said, label, np.zeros(len(label), np.int64), 1)[0]
+    predicted = (scores >= 0.5).astype(np.float64)
+    counts = confusion(predicted, label, np.zeros(len(label), np.int64), 1)[0]
     return float(balanced_accuracy(counts)), area_under_roc(label, scores.astype(np.float64))
 
 
-def _full(mixture: Mixture, places: dict[str, str], out: Path, test: EncodedRuns) -> Row:
+def _full(mixture: Mixture, paths: dict[str, str], out: Path, test: EncodedRuns) -> Row:
     """`datagen train`, stage by stage, and its scores of the test run's clouds."""
     last, before = mixture.stages[-1], mixture.before
     stage = "stage1" if last.source == "heuristic" else "stage2" if before else "sim-only"
@@ -104,23 +104,23 @@ def _full(mixture: Mixture, places: dict[str, str], out: Path, test: EncodedRuns
     def checkpoint(name: str, share: float) -> Path:
         return out / f"{name}-{share:g}.ckpt"
 
-    words = ["train", stage, places[last.source], "--house-share", str(last.share), "--threads", "1"]
+    words = ["train", stage, paths[last.source], "--house-share", str(last.share), "--threads", "1"]
     words += ["--out", str(checkpoint(stage, last.share)), "--device", "cpu"]
     if last.source == "plan":
-        words += ["--val", places["val"]]
+        words += ["--val", paths["val"]]
     if before is not None:
         words += ["--init", str(checkpoint("stage1", before.stages[-1].share))]
     assert cli.run(words) == 0
     model, head = load_model(checkpoint(stage, last.share))
     scorer = ModelScorer(model, "full")
     scores = np.concatenate(
-        [scorer.score(batch) for batch in encoded_stream([places["test"]], False).epoch(0)]
+        [scorer.score(batch) for batch in encoded_stream([paths["test"]], False).epoch(0)]
     )
     return (*_judged(test.label[test.in_range] == 1, scores[test.in_range]), head.cost["train_cpu_s"])
 
 
 def _frozen(model: SharedModel, data: dict[str, EncodedRuns], share: float) -> Row:
-    """A new head on the pooled features of a model that stays as it is."""
+    """A new head on the pooled features of a frozen model."""
     began = time.process_time()
     scenes = subset_of_houses(data["plan"], share, 0)
     learn, judge, test = (
@@ -152,7 +152,7 @@ def _frozen(model: SharedModel, data: dict[str, EncodedRuns], share: float) -> R
 
 
 def _features(model: SharedModel, encoded: EncodedRuns, scenes: Any) -> tuple[Tensor, Tensor]:
-    """What the model's head is given (N, 2E) of these scenes' candidates, and their labels (N,)."""
+    """Inputs (N, 2E) of the model's head for these scenes' candidates, and their labels (N,)."""
     found: list[Tensor] = []
     handle = model.eval().head.register_forward_pre_hook(lambda _, given: found.append(given[0]))
     labels: list[Tensor] = []

@@ -2,14 +2,14 @@
 
     python -m benchmarks.graspability [--objects ycb:DIR] [--robot panda] [--stability] [--cold]
 
-`free`: poses in which the open hand and its last 8 cm of way touch nothing of the object; `clear`: of
-these, poses that also keep above what the upright object stands on; `scored`: varied ones of them,
+`free`: poses in which the open hand does not touch the object over its last 8 cm of approach; `clear`: of
+these, poses above the plane that the upright object stands on; `scored`: varied ones of them,
 tried in physics; `good`: scored, clear and held in at least `min_score` of the trials; `held`:
 share of these among the scored and clear ones. CPU seconds are those of this process; 0.0 where the grasps
-were kept from before.
+were in the cache.
 
-`--cold` works everything out anew. `--stability` also repeats trials with half the timestep and counts
-those that end differently.
+`--cold` computes everything without the cache. `--stability` also repeats trials with half the timestep and
+counts those that end differently.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def print_stability(models: list[ObjectModel], gripper: Gripper) -> None:
         trials, spent_s = 0, 0.0
         for model in models:
             scored = scored_grasps(model, gripper, JUDGED_GRASPS)
-            # Not the best ones only: evenly over a list that is sorted by score.
+            # Evenly over the list, so that not only its first grasps are tried.
             some = np.linspace(0, len(scored) - 1, min(_STABILITY_GRASPS, len(scored))).astype(int)
             if len(some) == 0:
                 continue

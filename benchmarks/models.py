@@ -1,4 +1,4 @@
-"""What each part of the `shared` model is worth: variants trained on runs and judged on others, as a table.
+"""Ablations of the `shared` model: variants trained on runs and judged on others, as a table.
 
     python -m benchmarks.models --train RUN [RUN ...] --judge RUN [--samples N] [--epochs 10]
 
@@ -64,9 +64,9 @@ def main() -> None:
         print(f"{words:<38} {right:>8.4f} {balanced:>8.4f} {area:>6.4f} {cpu_s:>6.0f}", flush=True)
 
 
-def _batches(places: Sequence[str], scenes: int, most: int) -> list[Batch[Tensor]]:
+def _batches(paths: Sequence[str], scenes: int, most: int) -> list[Batch[Tensor]]:
     batches: list[Batch[Tensor]] = []
-    for batch in SampleStream(places, scenes_per_batch=scenes).epoch(0):
+    for batch in SampleStream(paths, scenes_per_batch=scenes).epoch(0):
         if sum(map(len, batches)) >= most:
             break
         batches.append(to_torch(batch, "cpu"))

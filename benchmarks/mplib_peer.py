@@ -1,9 +1,9 @@
-"""What mplib reaches over given poses; run by an interpreter with numpy 1 and mplib, not by this project's.
+"""Rates of mplib over given poses; run by an interpreter with numpy 1 and mplib, not by this project's.
 
     PEER benchmarks/mplib_peer.py < QUESTION.json > ANSWER.json
 
 mplib crashes with numpy 2, so it has an environment of its own. `benchmarks.robots`
-asks it; the process knows nothing of this project.
+runs it; it imports nothing from this project.
 """
 
 import json
@@ -18,7 +18,7 @@ import numpy as np
 def main() -> None:
     """Read {urdf, srdf, move_group, seeds, start, poses: [[x y z qw qx qy qz]], plans}; print rates."""
     question = json.load(sys.stdin)
-    # mplib prints to the standard output, where the answer goes.
+    # mplib prints to the standard output, where the answer belongs.
     answer_to = os.dup(1)
     os.dup2(2, 1)
     planner = mplib.Planner(urdf=question["urdf"], srdf=question["srdf"], move_group=question["move_group"])

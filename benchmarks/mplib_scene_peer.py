@@ -1,8 +1,8 @@
-"""mplib's paths among points; run by an interpreter with numpy 1 and mplib, not by this project's.
+"""Rates of mplib's paths among points; run by an interpreter with numpy 1 and mplib, not by this project's.
 
     PEER benchmarks/mplib_scene_peer.py < QUESTION.json > ANSWER.json
 
-`benchmarks.planning` asks it; the process knows nothing of this project.
+`benchmarks.planning` runs it; it imports nothing from this project.
 """
 
 import json
@@ -17,7 +17,7 @@ import numpy as np
 def main() -> None:
     """Read {urdf, srdf, move_group, resolution_m, problems: [{start, pose, points}]}; print rates."""
     question = json.load(sys.stdin)
-    # mplib prints to the standard output, where the answer goes.
+    # mplib prints to the standard output, where the answer belongs.
     answer_to = os.dup(1)
     os.dup2(2, 1)
     planner = mplib.Planner(urdf=question["urdf"], srdf=question["srdf"], move_group=question["move_group"])

@@ -1,4 +1,4 @@
-"""The visibility that a cloud tells, against the one that rays through the whole scene told.
+"""The visibility estimated from a cloud, compared with the true one from rays through the whole scene.
 
 python -m benchmarks.observed_visibility RUN...
 """
@@ -17,11 +17,11 @@ from datagen.train.observed_visibility import observed_visibility
 from datagen.workers.labels.distance_visibility_score import heuristic
 
 
-def main(places: list[str]) -> None:
+def main(paths: list[str]) -> None:
     """Print correlation, errors, the rule's agreement, and CPU time, run by run."""
-    for place in places:
+    for path in paths:
         rho, found, labels, ruled, seconds = [], [], [], [], 0.0
-        for batch in SampleStream([place], extra=("visibility",), shuffle=False).epoch(0):
+        for batch in SampleStream([path], extra=("visibility",), shuffle=False).epoch(0):
             began = time.process_time()
             estimate = observed_visibility(batch.clouds, batch.robots, batch.candidates)
             seconds += time.process_time() - began
@@ -32,13 +32,14 @@ def main(places: list[str]) -> None:
             rho.append(true)
             found.append(estimate)
         true, estimate = np.concatenate(rho), np.concatenate(found)
-        label, said = np.concatenate(labels) == 1, np.concatenate(ruled) == 1
-        print(f"{place}: {len(true):,} candidates, {1e3 * seconds / len(true):.2f} CPU ms each")
+        label, predicted = np.concatenate(labels) == 1, np.concatenate(ruled) == 1
+        print(f"{path}: {len(true):,} candidates, {1e3 * seconds / len(true):.2f} CPU ms each")
         print(f"  correlation with rho         {np.corrcoef(true, estimate)[0, 1]:.3f}")
         print(f"  mean absolute error          {np.abs(estimate - true).mean():.3f}")
         print(f"  mean error                   {(estimate - true).mean():+.3f}")
-        print(f"  accuracy of the rule         {(said == label).mean():.3f}")
-        print(f"  balanced accuracy            {(said[label].mean() + (~said)[~label].mean()) / 2:.3f}")
+        print(f"  accuracy of the rule         {(predicted == label).mean():.3f}")
+        balanced = (predicted[label].mean() + (~predicted)[~label].mean()) / 2
+        print(f"  balanced accuracy            {balanced:.3f}")
 
 
 if __name__ == "__main__":

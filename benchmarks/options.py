@@ -6,7 +6,7 @@ import argparse
 
 
 def scene_options(about: str | None) -> argparse.ArgumentParser:
-    """A parser with what scenes are drawn from, how many, and their seed."""
+    """A parser with the sources, number and seed of drawn scenes."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--houses", default="builtin")
     parser.add_argument("--objects", default="builtin")

@@ -1,11 +1,11 @@
-"""Does physics make sense: one parameter of the trials changed at a time, over the same planned grasps.
+"""Sanity checks of the physics: one parameter of the trials changed at a time, over the same planned grasps.
 
     python -m benchmarks.physical_sense [--houses procthor:DIR] [--objects ycb:DIR] [--scenes 12]
 
 Planned candidates (clear and in range) are executed once by default, once more to see that nothing
-changes, then with other friction, mass, grip force, timestep and disturbances. A row says how many
-succeed, and how many of the default's labels flip. "label" is what `sim` gives, plans included; the other
-rows execute the first plan alone.
+changes, then with other friction, mass, grip force, timestep and disturbances. A row has the
+share that succeeds, and the share of the default's labels that flip. "label" is the label of `sim`, plans
+included; the other rows execute the first plan alone.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def plan_options(about: str | None) -> argparse.ArgumentParser:
-    """A parser with what `planned_cases` asks for."""
+    """A parser with the options of `planned_cases`."""
     parser = scene_options(about)
     parser.add_argument("--candidates", type=int, default=40, help="a scene")
     parser.add_argument("--plans", type=int, default=8, help="most planned candidates taken from a scene")
@@ -107,7 +107,7 @@ def planned_cases(options: argparse.Namespace) -> tuple[Specification, list[Case
 def outcomes(
     cases: list[Case], trial: TrialParams, disturb: Callable[[Case], Disturbance] | None = None
 ) -> list[str]:
-    """How the first plan of every case ends."""
+    """Outcomes of the first plan of every case."""
     ends: list[str] = []
     for case in cases:
         at = case.at

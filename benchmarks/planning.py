@@ -1,12 +1,12 @@
-"""The kinematic stage over whole grids: labels/s, where its time goes, and beside mplib.
+"""Motion planning over whole grids: labels/s, time by stage, and comparison with mplib.
 
     python -m benchmarks.planning [--houses procthor:DIR] [--objects ycb:DIR] [--scenes 12] [--quick]
     python -m benchmarks.planning --robot panda --peer PYTHON
 
-Times are CPU seconds of this process. Grasps come from the cache where it has them, and are counted apart.
+Times are CPU seconds of this process. Grasps come from the cache if it has them, and are timed separately.
 With --peer, the interpreter of an environment with numpy<2 and mplib 0.1.1 plans from the same tucked poses
 to the same pregrasps, among points on the surfaces of the same scenes. mplib's plan is one path with its
-timing; the one here is path, approach and lift, and finds its grasp itself.
+timing; a plan of this project is path, approach and lift, and includes the choice of the grasp.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _RESOLUTION_M = 0.02
 
 
 class Spent:
-    """CPU seconds and counts, by what they went to."""
+    """CPU seconds by stage and by outcome, and counts of outcomes."""
 
     def __init__(self) -> None:
         self.stage_s: dict[str, float] = defaultdict(float)
@@ -95,7 +95,7 @@ def _world(options: argparse.Namespace) -> World:
 def _plan_grid(
     options: argparse.Namespace, scene: Scene, candidates: SceneCandidates, spent: Spent
 ) -> list[dict[str, Any]]:
-    """Plan every candidate of a scene; the plans that were found, as problems for the peer."""
+    """Plan every candidate of a scene; return the plans found, as problems for the peer."""
     params = ArmParams()
 
     def measured(stage: str, start_s: float) -> None:
@@ -136,7 +136,7 @@ def _plan_grid(
 def _outcome(
     prepared: PlanningScene, T_world_base: F64, seed: int, scene: Scene, row: int
 ) -> tuple[str, PlanReport | None]:
-    """The outcome with the stages before planning that cost nothing."""
+    """The outcome, including the stages before planning that cost nothing."""
     robot = prepared.robot
     if prepared.grasps_free == 0:
         return "no_grasp", None
@@ -149,7 +149,7 @@ def _outcome(
 
 
 def _surface_points(scene: Scene, T_world_base: F64, reach_m: float) -> F64:
-    """Points (N, 3), base frame, spread evenly over what the arm could touch; the target is left out."""
+    """Points (N, 3), base frame, spread evenly over surfaces near the arm; the target is left out."""
     rng = np.random.default_rng(0)
     corners: list[F64] = []
     house = scene.house.house
@@ -195,10 +195,10 @@ def _print_peer(python: str, problems: list[dict[str, Any]], spent: Spent) -> No
         "resolution_m": _RESOLUTION_M,
     }
     script = Path(__file__).with_name("mplib_scene_peer.py")
-    asked = subprocess.run(
+    done = subprocess.run(
         [python, str(script)], input=json.dumps(question), capture_output=True, text=True, check=True
     )
-    theirs = json.loads(asked.stdout)
+    theirs = json.loads(done.stdout)
     found = spent.outcomes["success"]
     print(f"plans that were found here: {found / spent.outcome_s['success']:.0f} plans/s, whole plans")
     print(

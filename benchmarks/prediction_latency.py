@@ -4,7 +4,7 @@ r"""CPU seconds of a prediction: imports, loading, and each frame with a model t
         [--checkpoint CKPT] [--click U,V]
 
 FRAME is a folder of benchmarks.write_frames. Without a checkpoint an untrained model of the default
-size is used, which takes as long. The first frame is listed apart; of the others the median is.
+size is used, which takes as long. The first frame is listed separately; the others by their median.
 """
 
 from __future__ import annotations

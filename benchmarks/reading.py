@@ -5,8 +5,8 @@
 Without a run it makes one of random rows (4,096 points a scene, the worst case for size) in a
 temporary folder. `chunks`: the project's reader of chunks, which gives the same arrays as tensorstore and
 zarr-python do. `stream`: batches for training, in one process with its thread. By whole shard: all samples
-in stored order. Random: single samples drawn uniformly, each with its scene's cloud. Beside samples a second
-of wall time stand samples a second of CPU time, which other programs on the machine disturb less.
+in stored order. Random: single samples drawn uniformly, each with its scene's cloud. Samples per second of
+wall time are listed with samples per second of CPU time, which other programs on the machine disturb less.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def _print_sizes(run: Run) -> None:
 
 
 def _print_digests(folder: Path) -> None:
-    """What it costs to hold every file that a stream reads against its commit, once in a process."""
+    """Print the cost of checking every file that a stream reads against its commit, once per process."""
     stream = SampleStream([folder])
     shards = sorted((folder / "shards").glob("*/*"))
     paths = [p for s in shards for name in STREAMED for p in (s / name).glob("c.*")]
@@ -125,8 +125,8 @@ def _rate(work: Callable[[], int]) -> tuple[float, float]:
     return statistics.median(r[0] for r in rates), statistics.median(r[1] for r in rates)
 
 
-def _chunks(place: Path) -> int:
-    parts = open_parts([place], [*FIELDS, "scene_index"])
+def _chunks(path: Path) -> int:
+    parts = open_parts([path], [*FIELDS, "scene_index"])
     return sum(len(load_shard(s, part.arrays)[0]["label"]) for part in parts for s in part.shards)
 
 

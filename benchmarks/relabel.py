@@ -1,9 +1,9 @@
-"""How long it takes to label a run by another rule, and what it adds on disk, as a table.
+"""Time to label a run by another rule, and the space that it adds on disk, as a table.
 
     python -m benchmarks.relabel [--samples 180000] [--points 64] [--folder FOLDER]
 
-Rows are random; shards and files are as many, and of samples as large, as those of a real run of so many
-labels. Clouds are shared, so their size (--points) matters to the making of the run alone.
+Rows are random; shards, files and samples have the number and size of a real run with --samples labels.
+Clouds are shared, so their size (--points) affects only the time to make the run.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Labels of the same candidates under another draw of all that labels draw: grasps, seeds of IK, paths.
+"""Labels of the same candidates under other random numbers: for grasps, seeds of IK and paths.
 
     python -m benchmarks.repeatability RUN [--houses procthor:DIR] [--objects ycb:DIR] [--scenes 60]
 
-RUN is a run of `plan` or `sim` whose scenes and candidates are taken; it is labelled by `plan` with draw 0,
-as labels are made, and with --draws others. Printed are the share of labels that differ, of all candidates
-within reach and of those that are negative by draw 0, by outcome, with 95% intervals by bootstrap over
-scenes; then the CPU time of planning by outcome.
+RUN is a run of `plan` or `sim`. Its scenes and candidates are labelled by `plan` with draw 0, as in runs, and
+with --draws others. The output is the share of labels that differ, of all candidates within reach and of
+those that are negative by draw 0, by outcome, with 95% intervals by bootstrap over scenes; then the CPU time
+of planning by outcome.
 
     --set arm.grasps.per_object=600        compare also with other parameters, under draw 0
     --per-object                           also by object
@@ -167,8 +167,8 @@ def interval(
     n = int(at.max()) + 1
     some, all_ = (np.bincount(at, weights=w.astype(float), minlength=n) for w in (flips & rows, rows))
     weights = resample_weights(n, _RESAMPLES, np.random.default_rng(0)).astype(float)
-    of = weights @ all_
-    drawn = (weights @ some)[of > 0] / of[of > 0]
+    totals = weights @ all_
+    drawn = (weights @ some)[totals > 0] / totals[totals > 0]
     low, high = np.percentile(drawn, [2.5, 97.5]) if len(drawn) else (0.0, 0.0)
     return float(some.sum() / max(all_.sum(), 1)), float(low), float(high)
 

@@ -3,8 +3,8 @@
     python -m benchmarks.robots [--poses 1000] [--peer PYTHON]
 
 Times are CPU seconds of this process. `near` starts IK within about 20 degrees of a solution, `random`
-anywhere within the limits; `3 seeds` asks up to three random ones for each pose until one answers.
-Rates count answers of either kind. With --peer, the interpreter of an environment with numpy<2 and
+anywhere within the limits; `3 seeds` tries up to three random ones for each pose until one succeeds.
+Rates count failed calls too. With --peer, the interpreter of an environment with numpy<2 and
 mplib==0.1.1, mplib solves the same poses of the stock Panda, free of self-collision.
 """
 
@@ -35,7 +35,7 @@ CASES = (
     ("xarm7", None, 0.8),
     ("fetch", None, 0.8),
 )
-PEER_SEEDS = (1, 20)  # 20 is what mplib takes when it is not told
+PEER_SEEDS = (1, 20)  # 20 is mplib's default
 PEER_PLANS = 50
 
 
@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def _print_robot(name: str, reach_m: float | None, height_m: float, count: int) -> None:
-    # Opened before: what a process pays once (meshes, hulls) is not what a scene pays.
+    # Opened before: a process loads meshes and hulls once, not in every scene.
     robot = open_robot(name, reach_m, height_m)
     started = time.process_time()
     Robot(entry(ROBOTS, name, "--robot"), reach_m, height_m)

@@ -1,12 +1,12 @@
-"""From a cloud to a ranking: how long each model takes for one robot's candidates, and for a training step.
+"""Time of each model to rank one robot's candidates from a cloud, and of a training step.
 
     python -m benchmarks.scoring [--run RUN] [--candidates 600] [--threads 2]
 
 The cloud is the first scene's of the run, or, without one, drawn at random on a table with the target
-and clutter. Scoring: numpy arrays in, order of the candidates out, so that all that a robot waits for is in
-it. A training step: forward and backward over 4 scenes with 4 robots and 15 candidates each (`paper`: one
-robot), without reading. Parameters are fresh: time does not depend on them. Times are medians of
-wall time; beside them CPU time, which says more on a machine that does other things too.
+and clutter. Scoring takes numpy arrays and returns the order of the candidates: all that a robot waits for
+is included. A training step: forward and backward over 4 scenes with 4 robots and 15 candidates each
+(`paper`: one robot), without reading. Parameters are fresh: time does not depend on them. Times are medians
+of wall time, listed with CPU time, which is more reliable on a busy machine.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def _step(model: Model, batch: Batch[Any]) -> None:
 
 
 def _time(work: Callable[[], None], repeats: int) -> tuple[float, float]:
-    """Medians of wall and CPU seconds; where there are several, one more goes before."""
+    """Medians of wall and CPU seconds; several repeats follow one that is not timed."""
     if repeats > 1:
         work()
     wall, cpu = [], []

@@ -1,4 +1,4 @@
-r"""What selected labels are worth at equal CPU seconds: `submit --select` against random and new scenes.
+r"""The value of selected labels at equal CPU seconds: `submit --select` against random and new scenes.
 
     datagen submit plan --n 100000 --candidates in-range --candidates-per-scene 30 ... --out TRAIN
     datagen submit heuristic --robot panda-scaled --candidates in-range ... --out POOL
@@ -6,7 +6,7 @@ r"""What selected labels are worth at equal CPU seconds: `submit --select` again
     python -m benchmarks.selection TRAIN --selected SELECTED --val VAL --test TEST --out FOLDER \
         --houses procthor:DIR --objects ycb:DIR
 
-TRAIN plays a pool of candidates of which any label can be bought. For each seed, a model is trained on
+TRAIN is the pool of candidates whose labels can be bought. For each seed, a model is trained on
 --first labelled scenes, and each way buys labels for --budget CPU seconds:
 
 - uniform: random scenes of the pool, and random candidates in each
@@ -16,9 +16,9 @@ TRAIN plays a pool of candidates of which any label can be bought. For each seed
 - new scenes: scenes that are made for it, with all their candidates, as `datagen frontier` advises
 
 Seconds of a purchase are those of making its scenes, new or again, and of planning its candidates, by
-outcome (`selection_costs.py`). A model is then trained on the first and the bought labels, with as many
-labels shown and as many steps for every way, and judged on TEST. Intervals are over seeds and scenes;
-differences are paired by seed. Trainings are kept in FOLDER and not made again.
+outcome (`selection_costs.py`). A model is then trained on the first and the bought labels, with the same
+number of labels shown and of steps for every way, and judged on TEST. Intervals are over seeds and scenes;
+differences are paired by seed. Finished trainings in FOLDER are used again.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ WAYS: tuple[Way, ...] = get_args(Way)
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """TRAIN, whose S scenes have K candidates each, with what judges."""
+    """TRAIN with S scenes of K candidates each, the runs to validate and test on, and the costs."""
 
     train: EncodedRuns
     kind: Array  # (S, K) of the outcome, row in KINDS
@@ -80,7 +80,7 @@ class Purchase:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What a way came to."""
+    """The labels that one way bought, and the scores of its model."""
 
     numbers: F64  # (5,): labels, scenes, share of good labels, seconds before the first label, and of labels
     scores: F32  # (T,) of the test candidates within reach
@@ -103,8 +103,8 @@ def main() -> None:
         train, Run.open(given.selected), *sources, given.timed, model, out / "selection-costs.json"
     )
     data = Data(runs["train"], *_kinds_and_cheap(train, runs["train"]), runs["val"], runs["test"], costs)
-    asked = {"train": runs["train"].key} | {name: vars(given)[name] for name in _DECISIVE}
-    kept = out / f"selection-{digest_of(asked)[:12]}"
+    settings = {"train": runs["train"].key} | {name: vars(given)[name] for name in _DECISIVE}
+    kept = out / f"selection-{digest_of(settings)[:12]}"
     kept.mkdir(parents=True, exist_ok=True)
     found: dict[Way, list[Result]] = {way: [] for way in WAYS}
     with counting("trainings", False, of=given.seeds * len(WAYS)) as seen:
@@ -149,7 +149,7 @@ def _kinds_and_cheap(run: Run, encoded: EncodedRuns) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Shop:
-    """What one seed can buy: `pool` (P,) and `fresh` scenes of TRAIN, besides the `first` (S, K) labels."""
+    """Labels that one seed can buy: `pool` (P,) and `fresh` scenes of TRAIN, besides its `first` (S, K)."""
 
     data: Data
     given: argparse.Namespace
@@ -168,7 +168,7 @@ class Shop:
         return cls(data, given, seed, whole, np.sort(pool), fresh)
 
     def buy(self, way: Way) -> Purchase:
-        """What this way buys for the budget."""
+        """The purchase of this way for the budget."""
         if way == "new scenes":
             return self._new()
         if way == "uniform":
@@ -228,7 +228,7 @@ class Shop:
         }
         scenes = np.flatnonzero(chosen.any(axis=1))
         epochs = max(1, round(self.given.shown / rows.sum()))
-        # As many steps for all, however many candidates a scene has.
+        # The same number of steps for all ways, however many candidates a scene has.
         batch_scenes = max(1, round(len(scenes) * epochs / self.given.steps))
         stage = STAGES["sim-only"]
         options = Options("sim-only", "shared", MODEL_CONFIG, epochs, batch_scenes, lr=stage.lr,
@@ -245,7 +245,7 @@ class Shop:
 
 
 def _result(shop: Shop, way: Way, kept: Path) -> Result:
-    """The result of a way, read from `kept` where it is there."""
+    """The result of a way, read from `kept` if it exists there."""
     file = kept / f"{shop.seed}-{way.replace(', ', '-').replace(' ', '-')}.npz"
     if not file.exists():
         bought = shop.buy(way)

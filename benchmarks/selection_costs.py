@@ -38,7 +38,7 @@ class Costs:
     scored_scene_s: float
 
     def labels_s(self, kinds: Array, scenes: int, again: bool) -> float:
-        """Of candidates of these kinds (n,) in some scenes."""
+        """CPU seconds of labels of candidates of these kinds (n,) in N scenes."""
         a_scene = self.prepared_scene_s + (self.scene_again_s if again else self.new_scene_s)
         return float(scenes * a_scene + np.array(self.candidate_s)[kinds].sum())
 
@@ -55,7 +55,7 @@ def measured_costs(
     """The costs in `file`, or measured over scenes of TRAIN and written to it.
 
     Seconds of making a scene, new or again, are those of the ledgers of TRAIN and SELECTED. Labelling is
-    timed, and scaled so that TRAIN costs what its ledger says: a busy machine takes more CPU seconds.
+    timed, and scaled to the cost of TRAIN in its ledger: a busy machine takes more CPU seconds.
     """
     if not file.exists():
         timed = _timed(train, houses, objects, n_scenes)
@@ -74,9 +74,9 @@ def measured_costs(
         )
         with whole_file(file) as written:
             written.write(json.dumps({"scale": scale, "costs": asdict(costs)}).encode())
-    said = json.loads(file.read_bytes())
-    costs = Costs(**said["costs"])
-    _print(costs, said["scale"])
+    stored = json.loads(file.read_bytes())
+    costs = Costs(**stored["costs"])
+    _print(costs, stored["scale"])
     return costs
 
 

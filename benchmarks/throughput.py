@@ -6,9 +6,9 @@
 Whole runs through the functions of `datagen submit`, with Ray and a real store in a temporary
 folder; all figures come from the commit records. The steady rate of a job is the sum over its workers of
 labels per second from each worker's first commit to its last: it leaves out the start of Ray and
-the opening of sources, which are stated beside it. Jobs of `plan` and `sim` label whole grids, which are
-mostly furniture and distance, and candidates within reach, 15 a scene. The first run on a machine also works
-out the grasps of the objects that it draws, later ones read them from the cache.
+the opening of sources, which are listed with it. Jobs of `plan` and `sim` label whole grids, which are
+mostly furniture and distance, and candidates within reach, 15 a scene. The first run on a machine also
+computes the grasps of the objects that it draws, later ones read them from the cache.
 """
 
 from __future__ import annotations
@@ -48,19 +48,19 @@ IN_REACH = 15  # candidates a scene of the jobs within reach
 
 @dataclass(frozen=True)
 class Job:
-    """What one run cost. Times are wall seconds unless they say CPU."""
+    """Cost of one run. Times are wall seconds unless named CPU."""
 
     labels: int
     scenes: int
     whole_s: float  # Ray start, all shards, seal
     ray_s: float  # start and end of the cluster
     seal_s: float
-    opening_s: float  # what a worker's first attempt took longer than its others
+    opening_s: float  # extra time of a worker's first attempt over its others
     steady_per_s: float  # labels
     cpu_per_label_s: float
     core_share: float  # CPU seconds per wall second of a worker in an attempt
     write_share: float  # of a worker's steady time: encoding and writing a shard
-    between_share: float  # of a worker's steady time: commit, report and the way to the next attempt
+    between_share: float  # of a worker's steady time: commit, report and dispatch of the next attempt
     peaks_bytes: tuple[int, ...]  # peak resident memory of each attempt of the busiest worker, in order
     stored_bytes: int
     disk_bytes: int  # with the blocks of files and folders
@@ -167,7 +167,7 @@ def account(
 
 
 def seconds_of(commit: Commit) -> float:
-    """When the commit was made."""
+    """Time of the commit, seconds since the epoch."""
     return datetime.fromisoformat(commit.created).timestamp()
 
 
@@ -253,7 +253,7 @@ def print_jobs(jobs: dict[str, Job]) -> None:
 
 
 def print_targets(one: Job, two: Job, grid: Job) -> None:
-    """Figures beside what they should be."""
+    """Figures compared with their targets."""
     ratio = two.steady_per_s / one.steady_per_s
     writing = two.write_share + two.between_share
     per_label = two.stored_bytes / two.labels
@@ -276,7 +276,7 @@ def print_targets(one: Job, two: Job, grid: Job) -> None:
 
 
 def print_arms(plan: Job, sim: Job, plan_near: Job, sim_near: Job) -> None:
-    """What an arm's labels cost beside what they should, and where the time goes."""
+    """Cost of an arm's labels compared with targets, and the share of each stage."""
     execute_s = sim.stage_s["execute"] + sim_near.stage_s["execute"]
     trials_per_s = (sim.executed + sim_near.executed) / execute_s * sim.workers
     whole_s = sim.ray_s + sim.opening_s + 12_000 / sim.steady_per_s

@@ -1,13 +1,13 @@
-"""Executed trials: cost by part, beside whole simulation; the same in ManiSkill; solver and timestep.
+"""Executed trials: cost by part, compared with whole simulation and ManiSkill; solver and timestep.
 
     python -m benchmarks.trials [--houses procthor:DIR] [--objects ycb:DIR] [--scenes 12] [--maniskill 6]
                                 [--solver] [--repeat-share 0.25]
 
 Planned candidates (clear and in range) are sampled as a run samples them. The first plan of each is executed
 as in runs and whole, with the reach and all of holding simulated, and labels that flip are counted. A share
-of them is executed whole once more with friction larger by 1e-5 of it: flips that no physics explains.
+of them is executed whole once more with friction larger by 1e-5 of it: such flips have no physical cause.
 CPU seconds of this process; a rate is for one core. The first `--maniskill` of them are executed again in
-`DatagenGrasp-v1` on `physx_cpu`, built anew each as a trial is; loading ManiSkill is not counted.
+`DatagenGrasp-v1` on `physx_cpu`, each built again as a trial is; loading ManiSkill is not counted.
 `--solver` repeats all with other solver settings, each at its timestep and at half of it, undisturbed
 and disturbed, and counts the successes that flip.
 """
@@ -41,7 +41,7 @@ from datagen.workers.trials.trial_scene import (
 
 @dataclass(frozen=True)
 class Solver:
-    """What one row of the solver table changes."""
+    """Settings of one row of the solver table."""
 
     position_iterations: int
     velocity_iterations: int
@@ -152,7 +152,7 @@ def interval(count: int, n: int) -> str:
 
 @contextmanager
 def timed_phases(spent_s: dict[str, float]) -> Iterator[None]:
-    """Adds up CPU seconds of a trial by phase."""
+    """Add up CPU seconds of a trial by phase."""
     trial = execute._Trial  # pyright: ignore[reportPrivateUsage]
     kept = {name: getattr(trial, name) for name in ("_build", "_played", "_step")}
 

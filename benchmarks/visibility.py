@@ -2,10 +2,10 @@
 
     python -m benchmarks.visibility [--houses procthor:DIR] [--objects ycb:DIR] [--scenes 12] [--quick]
 
-Both look at the same settled scenes from the same eyes through the same 64 x 64 window. Times are CPU
-seconds of this process. Loading is what each needs before the first look at a scene: hierarchies for
-Embree, vertex buffers and textures for Bullet; once of everything anew, and once of the house alone,
-as a run does it, which keeps its objects.
+Both render the same settled scenes from the same eyes through the same 64 x 64 window. Times are CPU
+seconds of this process. Loading is the work before the first view of a scene: hierarchies for Embree,
+vertex buffers and textures for Bullet. It is timed for everything, and for the house alone, as in a run,
+which keeps its objects.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from datagen.workers.world import assemble_world
 from tests.workers.rendering.pybullet_visibility import PybulletScene
 
 TARGET_RATIO, TARGET_DIFFERENCE = 20.0, 0.02
-NEAR_M = 0.025  # a rasteriser's usual near plane, and a little for rays beside the middle one
+NEAR_M = 0.025  # a rasteriser's usual near plane, and a little more for rays off the middle
 EDGES = (0.0, 1e-9, 3e-4, 1e-3, 3e-3, 0.01, 0.02, 0.05, 0.2, 1.0)
 
 
@@ -51,7 +51,7 @@ class Looks:
     rho: F64  # (N, 2), by Embree and by TinyRenderer
     target_px: F64  # (N, 2), of the target alone
     clear: np.ndarray  # (N,), the base fits there
-    in_surface: np.ndarray  # (N,), the eye stands in, or right at, a wall, furniture or a thing
+    in_surface: np.ndarray  # (N,), the eye is in, or right at, a wall, furniture or an object
 
 
 def main() -> None:
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def look(options: argparse.Namespace) -> tuple[Looks, Spent, Spent]:
-    """rho of every candidate by both labellers, and what each spent."""
+    """rho of every candidate by both labellers, and the CPU seconds of each."""
     houses, objects = open_houses(options.houses), open_objects(options.objects)
     fields = {"seed": options.seed, "candidates.per_scene": options.candidates}
     spec = specify("heuristic", houses, objects, fields, None)
@@ -116,8 +116,8 @@ def look(options: argparse.Namespace) -> tuple[Looks, Spent, Spent]:
 def stand_in_surfaces(rays: RayScene, eyes_m: F64) -> np.ndarray:
     """Whether the first surface before each eye (N, 3) is seen from behind or nearer than NEAR_M.
 
-    There a rasteriser is easily wrong: where it leaves out the backs of triangles, or what lies before
-    its near plane, an eye within a wall looks through it. To rays the wall hides all the same.
+    There a rasteriser is easily wrong: where it leaves out back faces, or surfaces before its near plane, an
+    eye within a wall looks through it. For rays the wall still hides the target.
     """
     centre_m = rays.T_world_object[0, :3, 3]
     distance_m = np.linalg.norm(centre_m - eyes_m, axis=1)
@@ -143,7 +143,7 @@ def print_speed(labels: int, scenes: int, embree: Spent, tiny: Spent) -> None:
     ):
         ours_ms, theirs_ms = 1e3 * ours_s / scenes, 1e3 * theirs_s / scenes
         print(f"{name:<24} {ours_ms:>10.1f} {theirs_ms:>13.1f} {theirs_ms / ours_ms:>7.1f}")
-    # The target is for a run's way; building every object anew for each scene is beside the point.
+    # The target ratio is for loading as in a run, which does not build every object again for each scene.
     for name, ours_s, theirs_s, judged in (
         ("labels/s, looking alone", embree.look_s, tiny.look_s, True),
         ("  loading the house", embree.look_s + embree.house_s, tiny.look_s + tiny.house_s, True),
@@ -185,7 +185,7 @@ def print_agreement(looks: Looks) -> None:
 
 
 def verdict(reached: bool) -> str:
-    """How a figure stands to its target."""
+    """Whether a figure reached its target, in words."""
     return "reached" if reached else "MISSED"
 
 

@@ -16,7 +16,7 @@ import datagen
 
 
 def look(folder: Path) -> datagen.SensorFrame:
-    """What the camera sees of the first scene: points in its own frame, and its pose in the map."""
+    """The camera's frame of the first scene: points in its own frame, and its pose in the map."""
     scene = datagen.open_dataset(folder / "val").isel(scene=0)
     n = int(scene["n_points"])
     T_map_camera = scene["T_world_camera"].values  # map: z up, floor at z = 0

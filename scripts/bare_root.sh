@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
-# What this checkout's HEAD does on a bare Debian: python3, python3-venv, make and git, and no compiler.
+# Run this checkout's HEAD on a bare Debian: python3, python3-venv, make and git, and no compiler.
 #
 #     sudo scripts/bare_root.sh bookworm            # Debian 12, Python 3.11: make demo
 #     sudo scripts/bare_root.sh trixie demo test    # Debian 13, Python 3.13: make demo, make test
 #     sudo scripts/bare_root.sh trixie -- make venv # any command, run in the clone
 #
 # Needs debootstrap. Variables: BARE_ROOT, a folder for the root that is kept and used again (else one is made
-# below TMPDIR and removed); BARE_MIRROR, Debian's mirror; BARE_SHARE, folders with spaces between them that are
-# shown in the root, read-only, under their own names, such as assets. Proxies, pip's variables and
-# DATAGEN_ASSETS are passed on.
+# below TMPDIR and removed); BARE_MIRROR, Debian's mirror; BARE_SHARE, folders separated by spaces that are
+# mounted read-only at the same paths, such as assets. Proxies, pip's variables and DATAGEN_ASSETS are passed
+# on.
 set -euo pipefail
 
 suite=${1:?name a release: bookworm or trixie}
@@ -33,7 +33,7 @@ fi
 clone=$root/srv/datagen
 rm -rf "$clone"
 git clone --quiet --no-hardlinks "$checkout" "$clone"
-# The network as the host has it: names, and the authorities that it trusts.
+# The host's network settings: name resolution and trusted certificate authorities.
 cp /etc/resolv.conf "$root/etc/resolv.conf"
 cp /etc/ssl/certs/ca-certificates.crt "$root/etc/ssl/certs/ca-certificates.crt"
 
@@ -52,7 +52,7 @@ while IFS= read -r -d '' variable; do
 done < /proc/self/environ
 
 echo "$suite: $command"
-# A namespace of its own: mounts and processes end with it. Its variables are those of the inner shell.
+# A new namespace: mounts and processes end with it. The quoted variables belong to the inner shell.
 # shellcheck disable=SC2016
 ROOT=$root SHARE=${BARE_SHARE:-} unshare --mount --pid --fork bash -euc '
     mount --make-rprivate /

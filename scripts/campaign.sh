@@ -1,6 +1,6 @@
 # shellcheck shell=bash
-# Sourced by scripts that run datagen's commands one after the other: where assets and programs are, and steps.
-# ROOT is the checkout. Sets ASSETS (DATAGEN_ASSETS, or shared/assets beside the checkout) and BIN.
+# Sourced by scripts that run datagen's commands one after the other: paths of assets and programs, and steps.
+# ROOT is the checkout. Sets ASSETS (DATAGEN_ASSETS, or ../shared/assets) and BIN.
 ASSETS=$(realpath -m "${DATAGEN_ASSETS:-$ROOT/../shared/assets}")
 BIN=$(realpath -m "${BIN:-$ROOT/.venv/bin}")
 

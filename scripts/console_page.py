@@ -1,9 +1,9 @@
-"""The commands of a document, run in order: to fill in what they print, and to test that they do.
+"""Run the commands of a document in order, to fill in their output or to test it.
 
     python scripts/console_page.py docs/tutorials/make-labels.md --folder build/runs --set ASSETS=DIR --write
 
-A block fenced as `console` holds commands after `$ `, their further lines after `> `, and what they print.
-A last line `[exit 1]` tells an exit code other than 0. Progress, which goes to standard error, is left out.
+A block fenced as `console` holds commands after `$ `, their further lines after `> `, and their output. A
+last line `[exit 1]` is an exit code other than 0. Progress, which goes to standard error, is left out.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _EXIT = re.compile(r"\[exit ([0-9]+)\]")
 
 @dataclass(frozen=True)
 class Command:
-    """One command of a page, and what the page says that it prints."""
+    """One command of a page, with its output there."""
 
     lines: tuple[str, ...]
     output: tuple[str, ...]
@@ -45,13 +45,13 @@ def commands_of(page: str) -> list[Command]:
 
 
 def run_command(command: Command, folder: Path, environment: Mapping[str, str]) -> Command:
-    """The command with what it prints now, and its exit code."""
+    """Run the command; return it with its output and exit code now."""
     done = subprocess.run(
         ["bash", "-c", command.text], cwd=folder, env={**os.environ, **environment}, text=True,
         capture_output=True, check=False,
     )  # fmt: skip
     errors = [line for line in done.stderr.splitlines() if line.startswith(("error:", "Traceback"))]
-    here = str(folder.resolve())  # a page names no folder of the machine that filled it in
+    here = str(folder.resolve())  # pages name no folder of this machine
     output = tuple(line.rstrip().replace(here, ".") for line in [*done.stdout.splitlines(), *errors])
     return Command(command.lines, output, done.returncode)
 

@@ -1,4 +1,4 @@
-"""Writes docs/reference/data-format.md from the schemas (`make docs`)."""
+"""Write docs/reference/data-format.md from the schemas (`make docs`)."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def page() -> str:
 
 
 def _section(schema: RecordSchema, seen: list[RecordSchema]) -> str:
-    """A schema's tables; what an earlier one has just so is named and not repeated."""
+    """A schema's tables; arrays that equal those of an earlier schema are referenced and not repeated."""
     sizes = ", ".join(f"{name} {size}" for name, size in schema.sizes.items())
     axes = [f"Axis lengths (points and objects follow the specification): {sizes}.", ""]
     return "\n".join(

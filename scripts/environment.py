@@ -1,11 +1,11 @@
-"""Makes the project's virtual environment, .venv, with the versions that constraints.txt pins.
+"""Make the project's virtual environment, .venv, with the versions that constraints.txt pins.
 
     python3 scripts/environment.py [EXTRA...]
 
 The extras are those of pyproject.toml; all of them where none is named. Only the standard library is used.
-A later call returns at once where the environment holds the extras, and adds those that it lacks. When what
-pyproject.toml asks for, constraints.txt, the interpreter or the folder change, it is made anew; settings of
-linters and tests change nothing in it.
+A later call returns at once where the environment holds the extras, and adds those that it lacks. The
+environment is made again when the requirements in pyproject.toml, constraints.txt, the interpreter or the
+folder change; settings of linters and tests do not matter.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ENVIRONMENT = ROOT / ".venv"
 STAMP = ENVIRONMENT / "installed.json"
 OLDEST = (3, 11)
 EVERYTHING = ("all", "dev", "docs")
-# It pins a library without wheels from this version on that nothing imports (docs/development/decisions.md).
+# It pins a library that nothing imports, without wheels from this Python on (docs/development/decisions.md).
 ALONE, ALONE_FROM = "mani-skill", (3, 13)
 # Seconds between two lines of progress, on a terminal (where each replaces the last) and elsewhere.
 ON_TERMINAL_S, ELSEWHERE_S = 0.5, 15.0
@@ -34,13 +34,13 @@ ON_TERMINAL_S, ELSEWHERE_S = 0.5, 15.0
 
 def fingerprint() -> str:
     """sha256 over everything that decides what is installed, except the extras."""
-    # Not at the top: an interpreter too old to have it shall reach the message about its age.
+    # Not at the top: an interpreter too old to have it must reach the message about its version.
     import tomllib
 
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    asked = {key: pyproject[key] for key in ("build-system", "project")}
-    asked["setuptools"] = pyproject["tool"]["setuptools"]
-    parts = [sys.version, sys.prefix, str(ROOT), json.dumps(asked, sort_keys=True)]
+    required = {key: pyproject[key] for key in ("build-system", "project")}
+    required["setuptools"] = pyproject["tool"]["setuptools"]
+    parts = [sys.version, sys.prefix, str(ROOT), json.dumps(required, sort_keys=True)]
     parts.append((ROOT / "constraints.txt").read_text())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
@@ -106,8 +106,8 @@ def install(arguments: list[str]) -> bool:
                 break
             progress.read(line)
         except queue.Empty:
-            said = f"{time.monotonic() - started:4.0f} s: {progress.text(_count())}"
-            print(f"\r\x1b[K{said[:100]}" if terminal else said, end="" if terminal else "\n", flush=True)
+            report = f"{time.monotonic() - started:4.0f} s: {progress.text(_count())}"
+            print(f"\r\x1b[K{report[:100]}" if terminal else report, end="" if terminal else "\n", flush=True)
             due = time.monotonic() + pause_s
     code = process.wait()
     print("\r\x1b[K" if terminal else "", end="", flush=True)
@@ -124,7 +124,7 @@ class Progress:
         self.to_install = 0
 
     def read(self, line: str) -> None:
-        """Take in one line of pip's output."""
+        """Process one line of pip's output."""
         first, _, rest = line.strip().partition(" ")
         if first == "Collecting" and rest:
             self.latest = rest.split(" ")[0]
@@ -159,26 +159,26 @@ def main(arguments: list[str]) -> int:
             f"error: python {wanted} or newer is needed, this is {running} ({sys.executable}); "
             f"name another: make PYTHON=python{wanted}"
         )
-    asked = set(arguments or EVERYTHING)
+    requested = set(arguments or EVERYTHING)
     wanted = fingerprint()
     present = installed_extras(wanted)
-    if asked <= present or set(EVERYTHING) <= present:
+    if requested <= present or set(EVERYTHING) <= present:
         return 0
     started = time.monotonic()
-    extras = ",".join(sorted(asked | present))
+    extras = ",".join(sorted(requested | present))
     print(f"installing {extras} with pinned versions into .venv, for python {running}", flush=True)
     if not present:
         create()
     STAMP.unlink(missing_ok=True)
     pins = ["-c", str(ROOT / "constraints.txt")]
     done = install([*pins, "-e", f"{ROOT}[{extras}]"])
-    if done and asked & {"all", "sim"} and sys.version_info >= ALONE_FROM:
+    if done and requested & {"all", "sim"} and sys.version_info >= ALONE_FROM:
         done = install([*pins, "--no-deps", _pin(ALONE)])
     if not done:
         print("error: pip could not install the pinned libraries; see its message above", file=sys.stderr)
         return 1
     subprocess.run([sys.executable, str(ROOT / "scripts" / "system_libraries.py")], check=True)
-    STAMP.write_text(json.dumps({"fingerprint": wanted, "extras": sorted(asked | present)}) + "\n")
+    STAMP.write_text(json.dumps({"fingerprint": wanted, "extras": sorted(requested | present)}) + "\n")
     print(f"{_count()} packages in .venv after {time.monotonic() - started:.0f} s", flush=True)
     return 0
 

@@ -2,8 +2,8 @@
 
     python scripts/freeze_benchmark.py FILE.json RUNS [--version 1]
 
-FILE names the runs, what each asks and which objects it has; it is written anew with what RUNS/NAME holds. A
-run that is not there, or not complete, keeps its specification and stays unfrozen.
+FILE lists the runs by name, with their descriptions and objects. It is rewritten from the runs RUNS/NAME. A
+run that is missing or incomplete keeps its specification and stays unfrozen.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from datagen.schemas.run import Run
 from datagen.schemas.whole_files import whole_file
 
 
-def frozen(run: BenchmarkRun, place: Path) -> BenchmarkRun:
-    """The run with the specification and digests of the one at `place`. InputError where it is incomplete."""
-    made = Run.open(place)
-    found = digests_of(place)
+def frozen(run: BenchmarkRun, path: Path) -> BenchmarkRun:
+    """The run with the specification and digests of that at `path`. Raises InputError if it is incomplete."""
+    made = Run.open(path)
+    found = digests_of(path)
     return run.model_copy(update={"n": made.n, "spec": made.manifest.spec, "digests": found})
 
 
 def main() -> int:
-    """Freeze the runs that are complete, and say which are not."""
+    """Freeze the runs that are complete, and report the others."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("file", type=Path)
     parser.add_argument("runs", type=Path)

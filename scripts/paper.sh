@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# The whole story on real houses and objects: labels, a calibrated rule, two stages of training, tables.
+# The whole pipeline on real houses and objects: labels, a calibrated rule, two stages of training, tables.
 #
 #   scripts/paper.sh small|full [FOLDER]        (make paper-small, make paper)
 #
-# Everything lies below FOLDER (build/paper-small, build/paper). What is done is not made again: the same
-# command goes on where it was stopped. DATAGEN_ASSETS names the folder that has ycb/ and procthor/. Sizes can
-# be set from outside (HEURISTIC=6000 scripts/paper.sh small FOLDER).
+# Everything lies below FOLDER (build/paper-small, build/paper). Finished steps are skipped: the same command
+# continues where it stopped. DATAGEN_ASSETS names the folder that has ycb/ and procthor/. Sizes can be set
+# from outside (HEURISTIC=6000 scripts/paper.sh small FOLDER).
 set -euo pipefail
 ROOT=$(realpath "$(dirname "$0")/..")
 . "$ROOT/scripts/campaign.sh"
@@ -78,7 +78,7 @@ submit val-clear "$VAL_CLEAR" val 4 train sim --candidates clear "${SOME[@]}"
 submit test-in-range "$TEST_IN_RANGE" test 6 test sim --candidates in-range "${SOME[@]}"
 submit test-grid $((TEST_SCENES * CELLS)) test 5 test sim --candidates grid
 
-# 3. What the paper leaves open in its rule, fitted to the trials in validation houses; and labels by it.
+# 3. Parameters that the paper leaves open in its rule, fitted to trials in validation houses; labels by it.
 if ! [ -f "$OUT/rule.toml" ]; then
     step "calibrate"
     datagen calibrate "$OUT/runs/val-in-range" "$OUT/runs/val-clear" --out "$OUT/rule.toml" \
@@ -88,7 +88,7 @@ step "relabel"
 datagen relabel "$OUT/runs/heuristic" --config "$OUT/rule.toml" --out "$OUT/runs/calibrated"
 
 # 4. Three regimes: the rule's labels alone, trials alone, and trials after the rule's labels; the latter two
-#    again with a quarter of the houses, since what stage 1 is for is to need fewer trials.
+#    again with a quarter of the houses, since stage 1 should reduce the number of trials.
 TRAIN_SIM=("$OUT/runs/train-in-range" "$OUT/runs/train-clear")
 VAL_SIM=(--val "$OUT/runs/val-in-range" --val "$OUT/runs/val-clear")
 step "stage 1"
@@ -104,7 +104,7 @@ on_trials() {
 on_trials "" 1
 on_trials -quarter 0.25
 
-# 5. Tables I to III, in houses and on objects of which no model and no baseline has seen any.
+# 5. Tables I to III, in houses and on objects that no model and no baseline has seen.
 MODELS=("$OUT"/models/{stage1,sim-only,stage2,sim-only-quarter,stage2-quarter}.ckpt)
 FITTED=(--fit "$OUT/runs/val-in-range" --fit "$OUT/runs/val-clear" --heuristic "$OUT/rule.toml")
 if ! made_after "$OUT/tables.json" "${MODELS[@]}" "$OUT/rule.toml"; then

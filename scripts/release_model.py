@@ -2,9 +2,9 @@
 
     python scripts/release_model.py CKPT BENCHMARK.json
 
-BENCHMARK.json is what `datagen benchmark score CKPT ... --out BENCHMARK.json` wrote. The optimiser's state is
-left out of the shipped file. `datagen/released/recipe.md` says how the model was made: write it first. The
-demonstration is run, and its answer is on the card.
+BENCHMARK.json is the output of `datagen benchmark score CKPT ... --out BENCHMARK.json`. The optimiser's state
+is left out of the shipped file. `datagen/released/recipe.md` describes how the model is made: write it first.
+The card includes the result of the demonstration.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def ship(source: Path, target: Path) -> None:
 
 
 def facts_of(path: Path, results: dict[str, Any]) -> dict[str, Any]:
-    """The card of the shipped checkpoint, which has its place by now."""
+    """The card of the shipped checkpoint at `path`."""
     checkpoint = read_checkpoint(path)
     head = checkpoint.head
     scorer = load_scorer(path)
@@ -103,12 +103,12 @@ def metrics_of(results: dict[str, Any]) -> dict[str, Any]:
     """The numbers that the card names, by run."""
     name = released.RELEASED
     found: dict[str, Any] = {
-        run: {"count": told["candidates"], "scenes": told["scenes"], **told["methods"][name]}
-        for run, told in results["candidates"].items()
+        run: {"count": table["candidates"], "scenes": table["scenes"], **table["methods"][name]}
+        for run, table in results["candidates"].items()
     }
-    for run, told in results["grids"].items():
+    for run, table in results["grids"].items():
         for which in ("mixed", "hard"):
-            if (part := told[which]) is not None:
+            if (part := table[which]) is not None:
                 found[f"{run}, {which}"] = {
                     "scenes": part["scenes"],
                     "good": part["methods"][name]["good"],
@@ -118,7 +118,7 @@ def metrics_of(results: dict[str, Any]) -> dict[str, Any]:
 
 
 def demo_answer(scorer: ModelScorer) -> dict[str, Any]:
-    """What `datagen predict --demo` answers, without its pictures."""
+    """The result of `datagen predict --demo`, without its pictures."""
     answer = predict(
         scorer,
         frame=[released.sample_frame()],

@@ -3,8 +3,8 @@
 #
 #   scripts/released_model.sh [FOLDER]        (make model)
 #
-# Everything lies below FOLDER (build/model). What is done is not made again: the same command goes on where it
-# was stopped. DATAGEN_ASSETS names the folder that has ycb/ and procthor/. Sizes can be set from outside
+# Everything lies below FOLDER (build/model). Finished steps are skipped: the same command continues where it
+# stopped. DATAGEN_ASSETS names the folder that has ycb/ and procthor/. Sizes can be set from outside
 # (LABELS=3000 SCENES=20 scripts/released_model.sh FOLDER).
 set -euo pipefail
 ROOT=$(realpath "$(dirname "$0")/..")

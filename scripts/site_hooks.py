@@ -1,4 +1,4 @@
-"""What the site adds to the documents: the help of every verb, files of examples, links to whole pictures."""
+"""Additions of the site to the documents: help of every verb, titles of examples, links to whole pictures."""
 
 from __future__ import annotations
 

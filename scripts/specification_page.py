@@ -1,4 +1,4 @@
-"""Writes docs/reference/specification.md, the page of all fields that a configuration file can set."""
+"""Write docs/reference/specification.md, the page of all fields that a configuration file can set."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _write(
 
 
 def _section_of(annotation: Any) -> type[BaseModel] | None:
-    """The model of a section that may be absent, None for what is no section."""
+    """The model of a section that may be absent, None for other fields."""
     parts = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else ()
     models = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
     return models[0] if models else None
@@ -90,7 +90,7 @@ def _comment(field: FieldInfo) -> str:
 
 
 def _choices(annotation: Any) -> str:
-    """The words that a field takes, where it takes words only or beside numbers."""
+    """The words that a field accepts, alone or in addition to numbers; empty where it accepts none."""
     words = _words(annotation)
     if not words:
         return ""

@@ -1,8 +1,8 @@
-"""Checks the shared libraries that some Python wheels expect of the system; installs them if it may.
+"""Check the shared libraries that some Python wheels expect of the system, and install them where possible.
 
 Only the standard library is used, so that it runs before anything is installed. As root with apt-get
 the missing packages are installed; otherwise the exact command is printed. It always exits with 0: runs can
-be checked, read and learned from without these libraries.
+be checked, read and used for training without these libraries.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def packages_for(libraries: list[str]) -> list[str]:
 
 
 def install_command(packages: list[str]) -> str:
-    """The line a person can paste."""
+    """The shell command that installs the packages."""
     prefix = "" if os.geteuid() == 0 else "sudo "
     return (
         f"{prefix}apt-get update && {prefix}apt-get install -y --no-install-recommends {' '.join(packages)}"
@@ -62,7 +62,7 @@ def install_command(packages: list[str]) -> str:
 
 
 def _install() -> bool:
-    """apt-get update and install what is missing; False when apt refused."""
+    """Run apt-get update and install the missing packages; False when apt-get failed."""
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
 
     def succeeds(*arguments: str) -> bool:
@@ -76,7 +76,7 @@ def _install() -> bool:
 
 
 def main() -> int:
-    """Check, fix where possible, say what is left."""
+    """Check the libraries, install them where possible, and report the missing ones."""
     if sys.platform != "linux":
         return 0
     missing = missing_libraries()
@@ -84,7 +84,7 @@ def main() -> int:
     if missing and has_apt and os.geteuid() == 0:
         print("installing system libraries: " + ", ".join(missing), flush=True)
         if not _install():
-            print("apt-get failed; going on without them", file=sys.stderr)
+            print("apt-get failed; continuing without them", file=sys.stderr)
         missing = missing_libraries()
     if not missing:
         return 0

@@ -1,4 +1,4 @@
-"""What it costs to reach a run's files without following links, in microseconds a call.
+"""Cost of opening a run's files without following links, in microseconds per call.
 
 python -m benchmarks.faults.confinement [--rounds 500]
 """
@@ -19,7 +19,7 @@ KEY = "shards/000001/000001-abcd-000001/points_m/c.0.0"
 
 
 def microseconds(call: Callable[[], object], rounds: int) -> float:
-    """The least mean of many rounds of ten calls: one that nothing else of the machine came into."""
+    """The smallest mean over rounds of ten calls: that of an undisturbed round."""
     least = float("inf")
     for _ in range(rounds):
         start_s = time.perf_counter()

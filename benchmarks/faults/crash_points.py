@@ -4,9 +4,9 @@
 
 Points are: a kill before each call that changes a file, a kill after half the bytes of each write, an
 input/output error of each call, and a disk that is full from each call on. After each, a fresh process
-looks at the run, continues as a user would, and looks again. `absent` and `there` are points after which
-every unit was as before or as after; `between`, those with some units of several there; `refused`, those
-that ended in an error of one line. Violations are points after which a unit was neither.
+checks the run, continues as a user would, and checks again. `absent`: points after which every unit is as
+before the operation; `there`: as after it; `between`: some units of several as after it; `refused`: points
+that ended in an error of one line. Violations: points after which a unit is neither.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def main() -> int:
                 + f"{len(found.violations):>12,}",
                 flush=True,
             )
-            violations += [f"{found.operation}: {what}" for what in found.violations]
+            violations += [f"{found.operation}: {violation}" for violation in found.violations]
     print(f"{'all':<16}" + "".join(f"{sums[head]:>9,}" for head in heads) + f"{len(violations):>12,}")
     for violation in violations[:50]:
         print(violation)

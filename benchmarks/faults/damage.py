@@ -1,9 +1,9 @@
-"""A run damaged in every way: what checks miss, and what repair does not bring back.
+"""Damage of every kind to a run: damage that checks miss, and bytes that repair does not restore.
 
     python -m benchmarks.faults.damage [--flips 1000] [--cuts-every 1] [--repair-every 1]
 
 Random single bit flips over every sort of file, and each file in turn removed, cut and grown; each damage is
-checked, repaired and checked again, and the run is then compared with what it was, byte by byte.
+checked, repaired and checked again, and the run is then compared with the original, byte by byte.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tests.faults.damage_campaign import (
 
 
 def main() -> None:
-    """Print the table; ends with 1 where anything was missed or not brought back."""
+    """Print the table; ends with 1 where anything was missed or not restored."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     options.add_argument("--flips", type=int, default=1000)
     options.add_argument("--cuts-every", type=int, default=1, help="take each N-th removal and cut only")

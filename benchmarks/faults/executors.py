@@ -4,7 +4,7 @@ python -m benchmarks.faults.executors [--kills 4] [--runs 1] [--shards 12] [--se
 
 Each run is made on a cluster of two slots, one of whose servers is killed `--kills` times. Its job completes,
 or ends and is resumed; the sealed bytes are those of an undisturbed run, no shard is quarantined, and the
-ledger holds the commits and the waste, and nothing else. Anything else is an AssertionError.
+ledger holds the commits and the waste, and nothing else. Anything else raises AssertionError.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=4, help="of one server in one run")
     parser.add_argument("--runs", type=int, default=1, help="for each of the two servers")
     parser.add_argument("--shards", type=int, default=12)
-    parser.add_argument("--seconds", type=float, default=0.5, help="what a shard takes")
+    parser.add_argument("--seconds", type=float, default=0.5, help="duration of a shard")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     rng = np.random.default_rng(options.seed)

@@ -1,4 +1,4 @@
-"""Any history of commits, crashes, resumes, merges and repairs: does each run say what a dictionary says?
+"""Random histories of commits, crashes, resumes, merges and repairs: does each run match a dictionary?
 
 python -m benchmarks.faults.histories [--examples 200] [--steps 50]
 """
@@ -14,7 +14,7 @@ from tests.properties.test_state_machine import AnyHistory, many_histories
 
 
 def main() -> None:
-    """Print how many histories were tried; the shortest that breaks a promise is an AssertionError."""
+    """Print how many histories were tried; raises AssertionError for the shortest that breaks a promise."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--examples", type=int, default=200)
     parser.add_argument("--steps", type=int, default=50, help="at most, of one history")

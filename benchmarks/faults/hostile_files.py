@@ -1,4 +1,4 @@
-"""Files made to do harm, wherever a verb reads one: one line, exit code 2, little memory, no waiting.
+"""Hostile files wherever a verb reads one: expects one line, exit code 2, little memory and no waiting.
 
     python -m benchmarks.faults.hostile_files [--only WORD] [--memory-gb 2] [--limit-s 300]
 
@@ -71,13 +71,13 @@ def houses_cases(folder: Path) -> Iterator[Case]:
 
 
 def objects_cases(folder: Path) -> Iterator[Case]:
-    """Folders of objects with one file replaced by what is no file."""
+    """Folders of objects with one file replaced by something that is not a regular file."""
     submit = ["submit", "heuristic", "--n", "16", "--workers", "0", "--out", str(folder / "run")]
-    for place in ("objects.json", "textured.obj", "texture_map.png", "collision.obj"):
+    for name in ("objects.json", "textured.obj", "texture_map.png", "collision.obj"):
         for kind, put in ODD_FILES.items():
-            home = write_bundle(folder / f"objects {kind} {place}", "box")
-            file = next(iter(sorted(home.rglob(f"*{Path(place).suffix}"))), home / place)
-            file = next(iter(home.rglob(place)), file)
+            home = write_bundle(folder / f"objects {kind} {name}", "box")
+            file = next(iter(sorted(home.rglob(f"*{Path(name).suffix}"))), home / name)
+            file = next(iter(home.rglob(name)), file)
             file.unlink()
             put(file)
             words = [*submit, "--objects", f"ycb:{home}"]
@@ -129,10 +129,10 @@ def run_case(case: Case, scratch: Path, memory_bytes: int, limit_s: float) -> Ou
     }
 
     started_s = time.perf_counter()
-    with (scratch / "told").open("w+b") as told:
+    with (scratch / "told").open("w+b") as output:
         command = [sys.executable, "-m", "datagen.cli", *case.words]
         process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=told, env=environment
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=output, env=environment
         )
         resource.prlimit(process.pid, resource.RLIMIT_DATA, (memory_bytes, memory_bytes))
         late = threading.Timer(limit_s, process.kill)
@@ -140,20 +140,20 @@ def run_case(case: Case, scratch: Path, memory_bytes: int, limit_s: float) -> Ou
         _, status, usage = os.wait4(process.pid, 0)
         late.cancel()
         process.returncode = os.waitstatus_to_exitcode(status)
-        told.seek(0)
-        text = told.read().decode("utf-8", "replace")
+        output.seek(0)
+        text = output.read().decode("utf-8", "replace")
         lines = [line for line in without_phases(text) if line[:1] != "{"]
     took_s = time.perf_counter() - started_s
     broken = f"no answer in {limit_s:g} s" if took_s >= limit_s else ""
     if not broken and process.returncode not in case.passes:
         broken = f"exit code {process.returncode}: {lines[-1][:200] if lines else ''}"
     elif not broken and (len(lines) != 1 or not lines[0].startswith("error: ") or not lines[0].isprintable()):
-        broken = f"{len(lines)} lines, the last {lines[-1][:200]!r}" if lines else "nothing is said"
+        broken = f"{len(lines)} lines, the last {lines[-1][:200]!r}" if lines else "no line is printed"
     return Outcome(case, usage.ru_maxrss / 1024, took_s, broken)
 
 
 def rows_of(outcomes: list[Outcome]) -> Iterator[tuple[str, ...]]:
-    """One row a verb: kinds tried, answered as promised, the most memory and the longest time of one."""
+    """One row per verb: kinds tried, kinds refused as promised, largest memory and longest time of one."""
     groups: dict[str, list[Outcome]] = defaultdict(list)
     for outcome in outcomes:
         groups[outcome.case.verb].append(outcome)

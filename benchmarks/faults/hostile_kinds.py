@@ -1,4 +1,4 @@
-"""What a hostile file may be: the kinds that `hostile_files` puts into each place."""
+"""Kinds of hostile files, which `hostile_files` puts in place of each file."""
 
 from __future__ import annotations
 

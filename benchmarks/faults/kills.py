@@ -17,12 +17,12 @@ def main() -> None:
     parser.add_argument("--worker-kills", type=int, default=200)
     parser.add_argument("--driver-kills", type=int, default=50)
     parser.add_argument("--shards", type=int, default=600)
-    parser.add_argument("--seconds", type=float, default=0.1, help="what a shard takes")
+    parser.add_argument("--seconds", type=float, default=0.1, help="duration of a shard")
     parser.add_argument("--workers", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     with memory_folder() as folder:
-        told = kill_at_random(
+        counts = kill_at_random(
             folder,
             options.worker_kills,
             options.driver_kills,
@@ -32,7 +32,7 @@ def main() -> None:
             options.seed,
         )
     print("the sealed store equals an uninterrupted run's; executions, ledger, commits and audit agree")
-    for name, value in told.items():
+    for name, value in counts.items():
         print(f"{name:32} {value:>10.3f}" if isinstance(value, float) else f"{name:32} {value:>10,}")
 
 

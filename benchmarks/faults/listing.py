@@ -89,10 +89,10 @@ def answer_times(run: Run) -> dict[str, tuple[float, float]]:
     times: dict[str, tuple[float, float]] = {}
     for name, (imported, answer) in _ANSWERS.items():
         program = _TIMED.format(imported=imported, answer=answer)
-        told = subprocess.run(
+        done = subprocess.run(
             [sys.executable, "-c", program, run.storage.url], check=True, capture_output=True, text=True
         )
-        took_s, mib = json.loads(told.stdout)
+        took_s, mib = json.loads(done.stdout)
         times[name] = (took_s, mib)
     return times
 
@@ -117,8 +117,8 @@ def main() -> None:
                 columns = [f"{s:>8.2f} s {m:>5.0f} MiB" for s, m in ((took_s, mib), without[name])]
                 print(f"{commits:>8} {name:16} {' '.join(columns)}")
             sizes = [file.size for file in run.storage.list("index")]
-            told = f"{refresh_s:>8.2f} s, {len(sizes)} files, {sum(sizes) / 2**20:.1f} MiB"
-            print(f"{commits:>8} {'index anew':16} {told}")
+            line = f"{refresh_s:>8.2f} s, {len(sizes)} files, {sum(sizes) / 2**20:.1f} MiB"
+            print(f"{commits:>8} {'index anew':16} {line}")
             start_s = time.perf_counter()
             refresh(run)
             print(f"{commits:>8} {'index as it is':16} {time.perf_counter() - start_s:>8.2f} s", flush=True)

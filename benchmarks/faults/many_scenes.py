@@ -58,19 +58,19 @@ Samples = list[tuple[float, int]]  # (share of the work that is done, bytes)
 def own_bytes(process: psutil.Process) -> int:
     """Resident bytes that the process shares with no other; 0 where it has ended."""
     try:
-        told = process.memory_info()
-        return told.rss - told.shared
+        memory = process.memory_info()
+        return memory.rss - memory.shared
     except psutil.Error:
         return 0
 
 
-def watched(command: Sequence[str], place: Path) -> dict[str, Samples]:
+def watched(command: Sequence[str], path: Path) -> dict[str, Samples]:
     """Memory of the driver and of its largest worker while the command makes a run of N shards."""
     samples: dict[str, Samples] = {"driver": [], "worker": []}
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as job:
         driver = psutil.Process(job.pid)
         while job.poll() is None:
-            run = Run.open(place) if (place / "plans/1.json").exists() else None
+            run = Run.open(path) if (path / "plans/1.json").exists() else None
             done = len(run.committed()) / len(run.planned()) if run else 0.0
             samples["driver"].append((done, own_bytes(driver)))
             workers = [p for p in driver.children(recursive=True) if p.name().startswith("ray::")]
@@ -116,8 +116,8 @@ def main() -> None:
         print(f"{options.scenes:,} scenes in {time.perf_counter() - start_s:.0f} s")
         start_s = time.perf_counter()
         reading = [sys.executable, "-c", _READ, str(folder / "run")]
-        told = subprocess.run(reading, check=True, capture_output=True, text=True).stdout
-        samples["reader"] = json.loads(told)
+        output = subprocess.run(reading, check=True, capture_output=True, text=True).stdout
+        samples["reader"] = json.loads(output)
         print(f"an epoch of reading in {time.perf_counter() - start_s:.0f} s")
     good = True
     print(f"{'process':8} {'before the middle':>18} {'at the end':>12}")

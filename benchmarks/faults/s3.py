@@ -2,12 +2,12 @@
 
     python -m benchmarks.faults.s3 [--shards 24] [--seeds 2] [--rate 0.05]
 
-The server is moto's, on the loopback address. Of `rate` of all requests two parts in five are refused
-with 500 or 503; one part each is done and answered 500, done and cut off in its answer, and held until the
-client gives up, done or not. Every third create-only put is done and answered 500. The store is down
-for a while five times a campaign, twice right after it has taken a commit. Each campaign ends with a look
-at every byte: committed files, copies of commits and the sealed store equal those of a local run that
-nothing befell, and the ledger has every execution once, with its end. Anything else is an AssertionError.
+The server is moto's, on the loopback address. A share `rate` of all requests fails: two fifths of them are
+refused with 500 or 503; one fifth each is done and answered 500, done and cut off in its answer, and held
+until the client times out, done or not. Every third create-only put is done and answered 500. The store is
+down for a while five times per campaign, twice right after it has stored a commit. Each campaign ends with a
+check of every byte: committed files, copies of commits and the sealed store equal those of an undisturbed
+local run, and the ledger has every execution once, with its end. Anything else raises AssertionError.
 """
 
 from __future__ import annotations

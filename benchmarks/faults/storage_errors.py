@@ -3,7 +3,7 @@
     python -m benchmarks.faults.storage_errors [--sample 12] [--only seal]
 
 Each failure must end in success or in one line of error and the documented exit code; the same command again
-must give what an undisturbed one gives, and nothing damaged. `refused` counts those that ended with an error.
+must give the result of an undisturbed one, without damage. `refused` counts those that ended with an error.
 Needs strace.
 """
 

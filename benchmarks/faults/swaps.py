@@ -1,11 +1,11 @@
-"""Whole files that exchanged their places: what checks miss, and what repair gets wrong or loses.
+"""Whole files that exchange their names: swaps that checks miss, and bytes that repair gets wrong or loses.
 
     python -m benchmarks.faults.swaps [--each 30]
 
 Two files of one sort exchange their names: records and their copies, and chunks of equal size; within a
-run, between the parts of a merged place, and between a sealed run, one that is not sealed and a merged
-place. After each swap the places are checked, repaired and checked again. `restored`: every byte is as
-before. `left`: something is left to find, and nothing but the two files differs. Anything else is wrong.
+run, between the parts of a merged run, and between a sealed run, one that is not sealed and a merged
+run. After each swap the runs are checked, repaired and checked again. `restored`: every byte is as
+before. `left`: checks still find something, and only the two files differ. Anything else is wrong.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def main() -> None:
     with fewer_arrays(), tempfile.TemporaryDirectory(dir=chosen.folder) as folder:
         clean, found, began_s = Path(folder) / "clean", Swaps(), time.perf_counter()
         make_world(clean)
-        if any(findings_at(clean / place) for place in PLACES):
-            raise SystemExit("the sound places have findings")
+        if any(findings_at(clean / name) for name in PLACES):
+            raise SystemExit("the sound runs have findings")
         for swap in swaps(clean, chosen.each or None, np.random.default_rng(chosen.seed)):
             try_swap(clean, Path(folder) / "world", swap, found)
     print(f"{'swapped':<26}{'tried':>10}{'restored':>10}{'left':>10}")

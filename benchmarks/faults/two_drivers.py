@@ -15,23 +15,23 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--shards", type=int, default=1000)
-    parser.add_argument("--seconds", type=float, default=0.1, help="what a shard takes")
+    parser.add_argument("--seconds", type=float, default=0.1, help="duration of a shard")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--drivers", type=int, default=2)
     options = parser.parse_args()
-    told: list[dict[str, float]] = []
+    counts: list[dict[str, float]] = []
     for stubborn in (True, False):
         with memory_folder() as folder:
-            told.append(
+            counts.append(
                 drive_in_pairs(
                     folder, options.shards, options.seconds, options.workers, stubborn, options.drivers
                 )
             )
     print("one winner a shard, every byte as committed, ledger = commits + waste in both")
-    print(f"{'':32} {'heedless':>12} {'making way':>12}")
-    for name in dict.fromkeys([*told[0], *told[1]]):
+    print(f"{'':32} {'ignoring':>12} {'yielding':>12}")
+    for name in dict.fromkeys([*counts[0], *counts[1]]):
         values = [
-            f"{row.get(name, 0):>12.3f}" if "share" in name else f"{row.get(name, 0):>12,}" for row in told
+            f"{row.get(name, 0):>12.3f}" if "share" in name else f"{row.get(name, 0):>12,}" for row in counts
         ]
         print(f"{name:32} {' '.join(values)}")
 
