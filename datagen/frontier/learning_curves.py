@@ -34,17 +34,15 @@ _LEAST_POINTS = 3
 
 @dataclass(frozen=True)
 class CurveForm:
-    """Terms and units of a curve: K - 1 dear sources after a cheap one, or K dear sources."""
+    """Terms and units of a curve: K - 1 dear sources after a cheap one, or K dear sources.
+
+    Parameters theta (..., P): e, a, log b, log w of each further dear source, then k and g of a cheap one.
+    """
 
     dear: int
     cheap: bool
     unit: float  # n0, labels
     cheap_unit: float = 1.0  # h0, labels
-
-    @property
-    def n_parameters(self) -> int:
-        """e, a, log b, then log w of each further dear source, then k and g."""
-        return 3 + (self.dear - 1) + 2 * self.cheap
 
     def effective(self, theta: F64, labels: F64) -> F64:
         """Equivalent labels m (...) of the first dear source for labels (..., K), cheap source first if any.

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 from datagen.schemas.errors import InputError
 
@@ -27,11 +25,6 @@ def released_checkpoint() -> Path:
 def sample_frame() -> Path:
     """The folder of the sample frame, as `datagen predict --frame` reads it."""
     return _shipped_path(FRAME)
-
-
-def released_card() -> dict[str, Any]:
-    """The facts of the model card."""
-    return json.loads(_shipped_path(CARD).read_bytes())
 
 
 def _shipped_path(name: str) -> Path:

@@ -51,10 +51,6 @@ class Prices(_Section):
             + self.gb_month.price * self.months_kept * stored_bytes / _GB
         )
 
-    def cpu_s_for(self, money: float) -> float:
-        """CPU seconds of one logical core that an amount of money pays for; infinite where they are free."""
-        return money / self.core_hour.price * _HOUR_S if self.core_hour.price else float("inf")
-
     def format(self, money: float) -> str:
         """An amount with its currency: 12.30 USD; below 0.1 with two significant digits: 0.0042 USD."""
         digits = 2 if money >= 0.1 or money <= 0 else 1 - floor(log10(money))

@@ -32,12 +32,12 @@ from tests.train.prediction.seen_scenes import MODEL
 FOLDER = released.FOLDER
 
 
-def results() -> dict[str, Any]:
-    return json.loads((FOLDER / released.RESULTS).read_bytes())
+def content(name: str) -> dict[str, Any]:
+    return json.loads((FOLDER / name).read_bytes())
 
 
 def test_the_file_is_the_one_on_the_card() -> None:
-    card, path = released.released_card(), released.released_checkpoint()
+    card, path = content(released.CARD), released.released_checkpoint()
     data = path.read_bytes()
     assert len(data) == card["bytes"] < 5_000_000
     assert hashlib.sha256(data).hexdigest() == card["sha256"]
@@ -52,7 +52,7 @@ def test_the_file_is_the_one_on_the_card() -> None:
 
 
 def test_the_metrics_on_the_card_are_those_of_the_recorded_results() -> None:
-    card, recorded = released.released_card(), results()
+    card, recorded = content(released.CARD), content(released.RESULTS)
     (method,) = recorded["methods"]
     assert method["checkpoint"]["weights_sha256"] == card["weights_sha256"]
     assert {key: recorded["benchmark"][key] for key in ("version", "digest")} == card["benchmark"]
@@ -73,7 +73,7 @@ def test_the_metrics_on_the_card_are_those_of_the_recorded_results() -> None:
 
 
 def test_the_page_is_written_from_the_facts() -> None:
-    page = card_text(released.released_card(), (FOLDER / released.RECIPE).read_text("utf-8"))
+    page = card_text(content(released.CARD), (FOLDER / released.RECIPE).read_text("utf-8"))
     assert page == (FOLDER / released.CARD_PAGE).read_text("utf-8")
 
 
@@ -103,7 +103,7 @@ def test_the_demonstration_answers_what_the_card_says(
     assert "base poses by the released model" in out and "demo.png" in out and "demo.html" in out
     assert Image.open(tmp_path / "demo.png").size[0] > 500
     assert b"<html" in (tmp_path / "demo.html").read_bytes()[:200]
-    said = released.released_card()["demo"]
+    said = content(released.CARD)["demo"]
     answer = json_of(capsys, ["predict", "--demo"])["best"]
     assert np.allclose([answer["x_m"], answer["y_m"]], said["base_xy_m"], atol=1e-3)
     assert math.isclose(answer["score"], said["score"], abs_tol=1e-3)
@@ -150,7 +150,7 @@ def test_releasing_another_model_writes_file_results_and_card(
     monkeypatch.setattr(released, "FOLDER", copy)
     write_untrained(tmp_path / "model.ckpt", MODEL)
     scorer = datagen.load_scorer(tmp_path / "model.ckpt")
-    board = json.loads(json.dumps(results()).replace(f'"{released.RELEASED}"', '"model"'))
+    board = json.loads(json.dumps(content(released.RESULTS)).replace(f'"{released.RELEASED}"', '"model"'))
     assert board["methods"][0]["name"] == "model"
     script = str(REPOSITORY / "scripts" / "release_model.py")
 

@@ -50,7 +50,6 @@ def test_money_is_the_sum_of_hours_and_of_bytes_over_the_months_kept(tmp_path: P
     assert prices.cost_of(gpu_s=1800) == pytest.approx(1.0)
     assert prices.cost_of(stored_bytes=2e9) == pytest.approx(2 * 0.5 * 6)
     assert prices.cost_of(3600, 1800, 2e9) == pytest.approx(7.01)
-    assert prices.cpu_s_for(0.01) == pytest.approx(3600)
     assert prices.format(1234.5) == "1,234.50 EUR" and prices.format(0.00123) == "0.0012 EUR"
     assert prices.record()["core_hour"]["date"] == "2026-11-01"
 
