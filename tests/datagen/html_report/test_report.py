@@ -198,7 +198,7 @@ def test_what_is_sampled_is_said(reported: Path, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(part_columns, "MOST_SHARDS", 9)
     page = report(tmp_path / "page.html", reported, "--scenes", "1")
     sampled = f"a random 9 of 10 shards: {9 * PER_SCENE} of {10 * PER_SCENE} labels"
-    assert f"Of {sampled}." in page.text and f"scenes ({sampled})" in page.text
+    assert f"From {sampled}." in page.text and f"scenes ({sampled})" in page.text
 
 
 def test_runs_over_the_same_candidates_are_compared(reported: Path, tmp_path: Path) -> None:
