@@ -40,7 +40,6 @@ from datagen.train.models.grouping import take_rows
 from datagen.train.models.hand_pooling import HandPooling
 from datagen.train.models.hand_poses import poses_of_clouds
 from datagen.train.models.model import Model, ModelConfig, read_config
-from datagen.train.models.tiles import TILE_CPU, TILE_CUDA, parts_for_threads, side_by_side, tiles
 from datagen.train.models.tokens import (
     N_KINDS,
     TARGET_NUMBERS,
@@ -53,6 +52,8 @@ from datagen.train.models.tokens import (
 )
 from datagen.train.observed_visibility import visible_shares
 
+# Candidates in one product: on a CPU their tokens stay in a core's cache.
+_TILE_CPU, _TILE_CUDA = 64, 4096
 # Height of an unknown camera above the mount: the difference of the middles of both ranges in the paper.
 _CAMERA_ABOVE_MOUNT_M = 0.4
 _MIN_REACH_M = 0.05
@@ -151,15 +152,7 @@ class SharedModel(Model):
         """Logits (N, 2)."""
         if not len(candidates):
             return candidates.base_xy_m.new_zeros((0, 2))
-        tokens = self.encode(clouds, robots)
-        parts = parts_for_threads(len(candidates), torch.get_num_threads())
-        if len(parts) < 2 or candidates.base_xy_m.is_cuda or not torch.is_inference_mode_enabled():
-            return self.score_tokens(tokens, clouds, candidates, robots)
-
-        def score(rows: slice) -> Tensor:
-            return self.score_tokens(tokens, clouds, take_rows(candidates, rows), robots)
-
-        return torch.cat(side_by_side(score, parts))
+        return self.score_tokens(self.encode(clouds, robots), clouds, candidates, robots)
 
     def encode(self, clouds: Clouds[Tensor], robots: RobotInputs[Tensor]) -> Tokens:
         """The clouds' tokens, the same for all candidates; without parameters, so they can be cached.
@@ -196,7 +189,7 @@ class SharedModel(Model):
             scalars = torch.cat(parts, dim=1)
         same, left = self._steered(tokens)
         condition, condition_left = self.condition(scalars), self.condition_left(target_left)
-        size = TILE_CUDA if scalars.is_cuda else TILE_CPU
+        size = _TILE_CUDA if scalars.is_cuda else _TILE_CPU
         cut = tiles(candidates.robot_row, size)
         pooled = [
             self._pool(
@@ -312,6 +305,28 @@ class SharedModel(Model):
             n = mask.sum(1).clamp(min=1)[:, None, None]
             parts += [of_kind.amax(2), of_kind.sum(2) / n]
         return torch.cat(parts, dim=2)
+
+
+def tiles(robot_row: Tensor, size: int) -> list[tuple[Tensor, Tensor]]:
+    """Robots (r,) and rows (r, c) of candidates of each, r c <= size; together they hold every row once.
+
+    `robot_row` (N,) has the candidates' robots. A robot's rows are cut into pieces of at most `size`, and
+    pieces of equal length are joined, without padding.
+    """
+    order = torch.argsort(robot_row, stable=True)
+    robots, counts = torch.unique_consecutive(robot_row[order], return_counts=True)
+    pieces: dict[int, list[tuple[int, Tensor]]] = {}
+    for robot, rows in zip(robots.tolist(), order.split(counts.tolist()), strict=True):
+        for piece in rows.split(size):
+            pieces.setdefault(len(piece), []).append((robot, piece))
+    cut: list[tuple[Tensor, Tensor]] = []
+    for length, equal in pieces.items():
+        together = size // length
+        for start in range(0, len(equal), together):
+            some = equal[start : start + together]
+            chosen = torch.tensor([robot for robot, _ in some], device=robot_row.device)
+            cut.append((chosen, torch.stack([rows for _, rows in some])))
+    return cut
 
 
 def _product(steering: Tensor, of_tokens: Tensor) -> Tensor:

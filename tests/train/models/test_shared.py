@@ -13,7 +13,7 @@ from torch import Tensor
 
 from datagen.train.models import Model
 from datagen.train.models.frames import frames_of, pair_features
-from datagen.train.models.tiles import parts_for_threads, side_by_side, tiles
+from datagen.train.models.shared import tiles
 from tests.train.models.made_batches import Tables, drawn_tables, small_model
 
 
@@ -76,40 +76,6 @@ def test_tiles_hold_every_candidate_once_with_its_robot(rows: list[int], size: i
 
 def frame_at(x: float, y: float, rise: float, camera: float) -> Tensor:
     return frames_of(torch.tensor([[x, y]]), *(torch.tensor([v]) for v in (rise, camera, 0.8, 0.1)))
-
-
-@pytest.mark.parametrize("threads", [2, 3])
-def test_parts_of_candidates_in_threads_have_the_scores_of_the_whole(threads: int):
-    model, tables = small_model("shared"), drawn_tables(candidates=50)
-    with torch.inference_mode():
-        whole = model.score(*tables)
-        torch.set_num_threads(threads)
-        try:
-            parts = model.score(*tables)
-            assert torch.get_num_threads() == threads
-        finally:
-            torch.set_num_threads(1)
-    torch.testing.assert_close(parts, whole, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("rows", [1, 64, 65, 300, 600])
-@pytest.mark.parametrize("threads", [1, 2, 5])
-def test_parts_for_threads_hold_every_row_once(rows: int, threads: int):
-    parts = parts_for_threads(rows, threads)
-    assert [k for part in parts for k in range(rows)[part]] == list(range(rows))
-    assert 1 <= len(parts) <= threads
-
-
-def test_an_error_in_one_part_reaches_the_caller_and_threads_stay():
-    def work(part: int) -> float:
-        assert torch.is_inference_mode_enabled()
-        return 1 / part
-
-    before = torch.get_num_threads()
-    with pytest.raises(ZeroDivisionError):
-        side_by_side(work, [1, 0])
-    assert torch.get_num_threads() == before
-    assert side_by_side(work, [2, 1]) == [0.5, 1.0]
 
 
 def test_a_point_on_the_line_of_sight_has_no_offset_from_it():
