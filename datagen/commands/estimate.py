@@ -46,7 +46,7 @@ def estimate(
     Args:
         runs: Runs of cheaper labels over the whole population.
         dear: Runs of the label source that is taken as the truth, over some of these candidates.
-        methods: Checkpoints or baselines to estimate the picks of: each robot's best clear candidate.
+        methods: Checkpoints, released or baselines to estimate the picks of: robots' best clear candidates.
         candidates: Candidate sets to report; grid: all [all that the runs cover].
         half_width: Half width of the wanted interval, such as 0.02; shows the further labels that it needs.
 

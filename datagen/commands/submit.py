@@ -33,6 +33,7 @@ from datagen.jobs.options import (
     refuse_odd_n,
 )
 from datagen.jobs.start_job import planned_run, refuse_unusable_engines, start_job
+from datagen.released import checkpoint_file
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED
@@ -106,7 +107,7 @@ def submit(
         candidates_from: Run from whose candidates n are selected and labelled (plan, sim).
         select: Rule of the selection: nearest to the model's threshold (margin), in proportion to its entropy
             (uncertain), or where model and stored label differ (disagree) [random].
-        model: Checkpoints for the selection; several: their mean.
+        model: Checkpoints for the selection, or released; several: their mean.
         random_share: Share of the selection that is random, so that each candidate has a chance.
         robot: fetch, panda, panda-scaled or xarm7; sets reach and height [plan, sim: panda-scaled].
         perturb: Arrivals per candidate, with random errors of pose; in sim also of the world [1, without].
@@ -183,7 +184,7 @@ def submit(
     words = ["submit", label_source, *words_of(given), *job_options.words()]
     if selecting is not None:
         for path in selecting.models:
-            words += ["--model", str(Path(path).expanduser().absolute())]
+            words += ["--model", str(Path(checkpoint_file(path) or path).expanduser().absolute())]
         words += ["--random-share", str(random_share)]
     if job_options.detach and job_options.address != "local":
         return detach_job(words, out, job_options)  # its sources are paths on the cluster

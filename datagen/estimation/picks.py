@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +11,7 @@ import numpy.typing as npt
 from datagen.estimation.mixed_labels import MixedLabels
 from datagen.evaluation_report.evaluated_runs import SCENES_PER_BATCH
 from datagen.evaluation_report.methods import EvaluatedMethod, open_models
+from datagen.released import checkpoint_file
 from datagen.schemas.errors import InputError, choices
 from datagen.schemas.progress import counting
 from datagen.train.baselines import BASELINES, FIELDS, make_baselines
@@ -38,8 +38,8 @@ class Scored:
 
 
 def open_methods(names: Sequence[str]) -> list[EvaluatedMethod]:
-    """Open checkpoints by file and baselines by name. InputError for others, and for baselines to fit."""
-    files = [name for name in names if Path(name).is_file()]
+    """Open checkpoints, `released` and baselines. InputError for other names, and for baselines to fit."""
+    files = {name: file for name in names if (file := checkpoint_file(name))}
     rules = [name for name in names if name not in files]
     for name in rules:
         if name not in BASELINES:
@@ -51,7 +51,7 @@ def open_methods(names: Sequence[str]) -> list[EvaluatedMethod]:
             usable = [b.name for b in make_baselines(list(BASELINES)) if not b.needs_fit]
             problem = "needs runs to fit its parameters on"
             raise InputError("--methods", baseline.name, problem, choices(usable))
-    return [*(EvaluatedMethod(b.name, b, state=b.state()) for b in made), *open_models(files)]
+    return [*(EvaluatedMethod(b.name, b, state=b.state()) for b in made), *open_models([*files.values()])]
 
 
 def score_population(

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from datagen.configuration.specify import layout_of
 from datagen.configuration.stored_scenes import StoredScenes
+from datagen.released import checkpoint_file
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.run import Run
@@ -122,12 +122,15 @@ def _layout(spec: Specification, scenes: int, per_scene: int, available: int) ->
 def _open(models: Sequence[str]) -> list[EvaluatedMethod]:
     if not models:
         return []
+    files: list[str] = []
     for model in models:
-        if not Path(model).is_file():
-            raise InputError("--model", model, "no such file", "Give a checkpoint of `datagen train`")
+        if not (file := checkpoint_file(model)):
+            fix = "Give a checkpoint of `datagen train`, or released"
+            raise InputError("--model", model, "no such file", fix)
+        files.append(file)
     from datagen.evaluation_report.methods import open_models
 
-    return open_models(models)
+    return open_models(files)
 
 
 def _select(

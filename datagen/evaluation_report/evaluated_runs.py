@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from datagen.released import RELEASED, released_checkpoint
+from datagen.released import checkpoint_file
 from datagen.reports.specification_summary import specification_record
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import open_runs
@@ -68,10 +68,8 @@ def split_paths(paths: Sequence[str]) -> tuple[list[str], list[str]]:
     for path in paths:
         if "://" in path or Path(path).is_dir():
             runs.append(path)
-        elif Path(path).is_file():
-            checkpoints.append(path)
-        elif path == RELEASED:
-            checkpoints.append(str(released_checkpoint()))
+        elif file := checkpoint_file(path):
+            checkpoints.append(file)
         else:
             fix = "Name checkpoints of `datagen train` and runs of `datagen submit sim`"
             raise InputError(path, "", "is neither a checkpoint file nor a run folder", fix)

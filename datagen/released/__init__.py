@@ -22,6 +22,13 @@ def released_checkpoint() -> Path:
     return _shipped_path(CHECKPOINT)
 
 
+def checkpoint_file(name: str) -> str | None:
+    """The file of a checkpoint, or None; `released` is the released model unless there is such a file."""
+    if Path(name).is_file():
+        return name
+    return str(released_checkpoint()) if name == RELEASED else None
+
+
 def sample_frame() -> Path:
     """The folder of the sample frame, as `datagen predict --frame` reads it."""
     return _shipped_path(FRAME)

@@ -10,9 +10,11 @@ import pytest
 
 from datagen import cli
 from datagen.estimation.mixed_labels import read_mixed
+from datagen.released import released_checkpoint
 from datagen.schemas.run import Run
 from datagen.schemas.selection import selection_of
 from datagen.train.dataset import SampleStream
+from datagen.train.training.checkpoints import read_checkpoint
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG, arrays_of, files_of, json_of, make_small_run
@@ -62,6 +64,18 @@ def test_selected_labels_are_those_of_the_whole_run(folder: Path) -> None:
     assert selection is not None
     np.testing.assert_array_equal(np.ravel(selection.probability), some["selection_probability"])
     assert "selection_probability" not in every
+
+
+def test_the_released_model_selects_and_is_estimated(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["released" if word.endswith("model.ckpt") else word for word in select_words(folder, "released")]
+    assert cli.run(words) == 0
+    selection = Run.open(folder / "released").manifest.spec.selection
+    assert selection is not None and selection.models == (read_checkpoint(released_checkpoint()).head.digest,)
+    runs = [str(folder / "cheap"), "--with", str(folder / "released")]
+    estimates = json_of(capsys, ["estimate", *runs, "--methods", "released"])["estimates"]
+    assert [each["population"] for each in estimates][-1] == "picks of released"
 
 
 def test_a_selected_run_is_sound_and_is_made_again_alike(
