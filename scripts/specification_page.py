@@ -58,7 +58,8 @@ def _write(
             _write(below, f"{prefix}{name}.", section, deeper, hidden)
             tables += [*section, *deeper]
         elif default is None:
-            rows.append(f"# {name} = {_toml(_words(field.annotation)[0])}  # absent, or {_comment(field)}")
+            value = [*_words(field.annotation), *_least(field)][0]
+            rows.append(f"# {name} = {_toml(value)}  # absent, or {_comment(field)}")
         else:
             comment = _comment(field)
             rows.append(f"{mark}{name} = {_toml(default)}" + (f"  # {comment}" if comment else ""))
@@ -87,6 +88,11 @@ def _comment(field: FieldInfo) -> str:
     else:
         bounds = ", ".join(sign + limit for sign, limit in limits.items())
     return "; ".join(filter(None, [_choices(field.annotation), bounds]))
+
+
+def _least(field: FieldInfo) -> list[Any]:
+    """The least value that a number may have, where it has one."""
+    return [item.ge for item in field.metadata if isinstance(item, Ge)]
 
 
 def _choices(annotation: Any) -> str:

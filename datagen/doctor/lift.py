@@ -86,6 +86,7 @@ def _plan(robot: Robot, T_base_grasp: F64) -> MotionPlan | None:
                 opening_m=robot.gripper.max_opening_m,
                 length_rad=0.0,
                 clearance_m=0.0,
+                grasp_score=1.0,
             )
     return None
 

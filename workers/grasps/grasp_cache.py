@@ -17,7 +17,7 @@ from datagen.schemas.specification import GraspParams
 from datagen.workers.content_cache import Arrays, CacheFolder
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.grasps.grasp import GraspSet
-from datagen.workers.grasps.search import BLOCK, VERSION, HandPoses, hand_poses_of, score_block
+from datagen.workers.grasps.search import BLOCK, VERSION, HandPoses, hand_poses_of, score_block, score_poses
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.gripper import Gripper, Parts
 
@@ -111,8 +111,17 @@ def grasps_of(model: ObjectModel, gripper: Gripper, params: GraspParams, draw: i
         search, row = later[k]
         return float(_score(known, digest, model, gripper, search, row // BLOCK)[row % BLOCK])
 
+    def pose_score(T_object_tcp: F64, opening_m: float) -> float:
+        rng = _generator([digest, T_object_tcp.tolist(), opening_m])
+        return float(score_poses(model, gripper, T_object_tcp[None], np.array([opening_m]), rng)[0])
+
     found = GraspSet(
-        np.concatenate(T), np.concatenate(openings), first.score[rows], params.min_score, later_score
+        np.concatenate(T),
+        np.concatenate(openings),
+        first.score[rows],
+        params.min_score,
+        later_score,
+        pose_score,
     )
     known.sets[key] = found
     return found

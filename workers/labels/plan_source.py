@@ -91,7 +91,7 @@ def _write(columns: Columns, k: int, trial: CandidateTrial) -> None:
 
 def _write_plan(columns: Columns, k: int, at: ArmInScene, T_world_base: F64, plan: MotionPlan) -> None:
     columns["T_target_tcp"][k] = target_tcp(at, T_world_base, plan)
-    columns["grasp_score"][k] = at.grasps.score_of(plan.grasp)
+    columns["grasp_score"][k] = plan.grasp_score
     columns["q_grasp_rad"][k] = plan.q_approach_rad[-1]
     columns["path_length_rad"][k] = plan.length_rad
     columns["path_clearance_m"][k] = plan.clearance_m

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from itertools import islice
 
 import numpy as np
 
@@ -14,9 +11,11 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.motion.arm_collision import Surroundings, surroundings
 from datagen.workers.motion.cartesian_path import follow_line
-from datagen.workers.motion.collision import Bools, Ints
+from datagen.workers.motion.collision import Ints
 from datagen.workers.motion.grasp_filter import backed, line_offsets_m, raised
+from datagen.workers.motion.grasp_goals import Goal, goals_of
 from datagen.workers.motion.motion_plan import MotionPlan, PlanReport
+from datagen.workers.motion.nearby_poses import NearbyPoses, scene_with_poses
 from datagen.workers.motion.planning_scene import PlanningScene
 from datagen.workers.motion.rrt_connect import connect, dense, is_line_free, shortened, straight
 
@@ -27,51 +26,63 @@ _STARTS = 3  # tucked poses from which a straight line is tried
 _SEARCHES = 4  # grasps for which a path is searched where no straight path is free
 _SHORTCUTS = 20
 _CLEARANCE_POSES = 8
-_FIRST_BATCH, _LARGEST_BATCH = 2, 64  # grasps checked together
-# Poses are sorted by distance in portions; each has this many more than all before it.
-_FIRST_PORTION = 24
-_FILTERED_AT_ONCE = 200
+# A round of the search near grasps has so many poses, near at most so many.
+_NEARBY_POSES, _NEARBY_ORIGINS = 1200, 40
+_NEARBY_TRIED = 60  # poses of a round for which IK is tried
 _SAME_RAD = 0.05  # solutions of one grasp that differ by less count as one
 
 
 @dataclass(eq=False)
-class _Search:
-    """State of the search for one candidate, shared by its grasps."""
+class _Base:
+    """A base pose in a scene."""
 
     scene: PlanningScene
     T_world_base: F64
-    T_base_world: F64
-    far: list[_Reachable] = field(default_factory=list)  # without a free straight path
-    furthest: str = "no_ik"
+
+    @cached_property
+    def T_base_world(self) -> F64:
+        return inverse(self.T_world_base)
 
     @cached_property
     def at(self) -> Surroundings:
         return surroundings(self.scene, self.T_world_base)
 
-    def reached(self, stage: str) -> None:
-        """Record a stage if it is the furthest so far."""
-        self.furthest = max(self.furthest, stage, key=STAGES.index)
+
+@dataclass(eq=False)
+class _Search:
+    """State of the search among some grasps for one candidate, shared by these grasps."""
+
+    scene: PlanningScene
+    base: _Base
+    far: list[_Reachable] = field(default_factory=list)  # without a free straight path
+    furthest: str = "no_ik"
+    stages: dict[int, int] = field(default_factory=dict)  # of each grasp tried, in this order
+
+    @property
+    def at(self) -> Surroundings:
+        return self.base.at
+
+    def reached(self, stage: str, *grasps: int) -> None:
+        """Record a stage that some grasps reached, if it is the furthest so far."""
+        rank = STAGES.index(stage)
+        self.furthest = STAGES[max(STAGES.index(self.furthest), rank)]
+        for k in grasps:
+            self.stages[k] = max(self.stages.get(k, 0), rank)
+
+    def best(self, count: int) -> list[int]:
+        """At most `count` of the grasps tried, those that came furthest first."""
+        return sorted(self.stages, key=lambda k: -self.stages[k])[:count]
 
     def holds(self, k: int) -> bool:
         """Whether the hand holds the object in kept grasp `k`; simulated on first use."""
-        return self.scene.around.holds(int(self.scene.around.grasp[k]))
-
-
-@dataclass(frozen=True, eq=False)
-class _Goal:
-    """A kept grasp, seen from the base."""
-
-    k: int
-    T_base_tcp: F64  # (4, 4)
-    seeds_rad: F64  # (S, A)
-    limit: str  # furthest stage that it can reach
+        return self.scene.around.grasps.holds(int(self.scene.around.grasp[k]))
 
 
 @dataclass(frozen=True, eq=False)
 class _Way:
     """Joints at a grasp and at its pregrasp."""
 
-    goal: _Goal
+    goal: Goal
     q_grasp: F64  # (A,)
     q_pregrasp: F64  # (A,)
 
@@ -98,104 +109,51 @@ def plan_candidate(
     kept, rest = (rows[~np.isin(around.grasp[rows], sorted(skip))] for rows in (around.kept, around.rest))
     if around.grasps_free == 0 or len(kept) + len(rest) == 0:
         return PlanReport("no_grasp", None, around.grasps_free, 0)
-    search = _Search(prepared, T_world_base, inverse(T_world_base))
-    plan, tried = None, set[int]()
-    for goals in _goals(prepared, search.T_base_world, kept, rest):
-        tried.update(int(around.grasp[goal.k]) for goal in goals)
+    search = _Search(prepared, _Base(prepared, T_world_base))
+    plan = _search_grasps(search, kept, rest, prepared.params.max_grasps_tried, rng)
+    tried = len(np.unique(around.grasp[list(search.stages)]))
+    if plan is None and prepared.params.nearby_rounds:
+        plan, more = _search_nearby(search, rng)
+        tried += more
+    outcome = search.furthest if plan is None else "success"
+    return PlanReport(outcome, plan, around.grasps_free, tried)
+
+
+def _search_grasps(
+    search: _Search, kept: Ints, rest: Ints, most: int, rng: np.random.Generator
+) -> MotionPlan | None:
+    """Search for a plan to at most `most` of the free poses `kept` and `rest`."""
+    for goals in goals_of(search.scene, search.base.T_base_world, kept, rest, most):
+        search.reached("no_ik", *(goal.k for goal in goals))
         plan = _try_goals(search, goals)
         if plan is not None or search.furthest == "no_start":
+            return plan
+    return _search_paths(search, rng)
+
+
+def _search_nearby(first: _Search, rng: np.random.Generator) -> tuple[MotionPlan | None, int]:
+    """Search near the grasps that came furthest, then near the best poses found; also the number tried."""
+    scene, tried, search = first.scene, 0, first
+    near = NearbyPoses.of_grasps(scene.around.T_world_tcp, scene.around.opening_m)
+    origins = first.best(_NEARBY_ORIGINS) or scene.around.kept[:_NEARBY_ORIGINS].tolist()
+    for _ in range(scene.params.nearby_rounds or 0):
+        if not origins or search.furthest == "no_start" or search.at.is_base_stuck:
             break
-    if plan is None and search.furthest != "no_start":
-        plan = _search_paths(search, rng)
-    outcome = search.furthest if plan is None else "success"
-    return PlanReport(outcome, plan, around.grasps_free, len(tried))
+        near = near.rows(np.array(origins)).varied(_NEARBY_POSES // len(origins), rng)
+        around = scene_with_poses(scene.around, near.T_world_tcp(), near.opening_m, scene.params)
+        search = _Search(replace(scene, around=around), first.base)
+        plan = _search_grasps(search, around.kept, around.rest, _NEARBY_TRIED, rng)
+        first.reached(search.furthest)
+        tried += len(search.stages)
+        if plan is not None:
+            return replace(plan, grasp=-1), tried
+        if search.furthest == "arm_collision":  # further rounds hardly ever lead out of a collision
+            break
+        origins = search.best(_NEARBY_ORIGINS)
+    return None, tried
 
 
-def _goals(prepared: PlanningScene, T_base_world: F64, kept: Ints, rest: Ints) -> Iterator[list[_Goal]]:
-    """At most `max_grasps_tried` of the free poses `kept` and `rest` with seeds near by, in growing batches.
-
-    `kept` come first, in portions of their order, in which neighbours differ much; in each portion, the poses
-    nearest to a seed come first. `rest` are sorted by that distance as a whole.
-    """
-    table, left, batch = prepared.moving.table, prepared.params.max_grasps_tried, _FIRST_BATCH
-    for rows, portion in ((kept, _FIRST_PORTION), (rest, len(rest))):
-        if left == 0:
-            return
-        T_base_tcp = np.matmul(T_base_world, prepared.around.T_world_tcp[rows])
-        within = _is_within_reach(prepared, T_base_world, T_base_tcp)
-        rows, T_base_tcp = rows[within], T_base_tcp[within]
-        end = 0
-        while left > 0 and end < len(rows):
-            start, end = end, min(len(rows), 2 * end + portion)
-            k, T = rows[start:end], T_base_tcp[start:end]
-            near = _is_wrist_within_reach(prepared, T_base_world, T, table.limit_m).all(axis=0)
-            k, T = k[near], T[near]
-            nearest = _nearest_first(prepared, T_base_world, T, table.distance(T))
-            # The hand's motion is checked for few at a time: most candidates need no more.
-            while left > 0 and (some := list(islice(nearest, _FILTERED_AT_ONCE))):
-                free = np.array(some)[prepared.around.is_free(k[some])][:left]
-                left -= len(free)
-                while len(free):
-                    now, free = np.split(free, [batch])
-                    seeds = table.seeds(T[now], prepared.params.ik_seeds)
-                    limits = _limits(prepared, T_base_world, T[now])
-                    yield list(map(_Goal, k[now].tolist(), T[now], seeds, limits))
-                    batch = min(2 * batch, _LARGEST_BATCH)
-
-
-def _nearest_first(
-    prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64, distance: F64
-) -> Iterator[int]:
-    """Rows of the poses (G, 4, 4) with a sample near by, nearest first; `distance` (G,) is theirs.
-
-    The pregrasp and the end of the lift need a sample near by too: the largest of the three distances counts.
-    It is computed for few poses at a time, because it is never smaller than `distance`.
-    """
-    order = np.argsort(distance, kind="stable")[: int(np.isfinite(distance).sum())]
-    waiting: list[tuple[float, int]] = []
-    for start in range(0, len(order), _FILTERED_AT_ONCE):
-        rows, later = np.split(order[start:], [_FILTERED_AT_ONCE])
-        ends = np.concatenate(_line_ends(prepared, T_base_world, T_base_tcp[rows]))
-        at_ends = prepared.moving.table.distance(ends).reshape(2, -1).max(axis=0)
-        farthest = np.maximum(distance[rows], at_ends)
-        waiting = sorted([*waiting, *zip(farthest.tolist(), rows.tolist(), strict=True)])
-        bound = float(distance[later[0]]) if len(later) else np.inf
-        ready = bisect_left(waiting, (bound, -1))
-        yield from (row for _, row in waiting[:ready])
-        waiting = waiting[ready:]
-
-
-def _line_ends(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> tuple[F64, F64]:
-    """The pregrasp and the end of the lift (G, 4, 4) of each grasp."""
-    T_lifted = T_base_tcp.copy()
-    T_lifted[:, :3, 3] += prepared.params.lift_m * T_base_world[:3, 2]
-    return backed(T_base_tcp, prepared.params.pregrasp_m), T_lifted
-
-
-def _limits(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> list[str]:
-    """The furthest stage that each grasp (G, 4, 4) can reach, by the length of the arm up to its wrist."""
-    grasp, pregrasp, lifted = _is_wrist_within_reach(prepared, T_base_world, T_base_tcp, 0.0)
-    return np.where(grasp & pregrasp, np.where(lifted, "success", "no_lift"), "no_ik").tolist()
-
-
-def _is_wrist_within_reach(
-    prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64, beyond_m: float
-) -> Bools:
-    """Whether the wrist is at most `beyond_m` beyond reach (3, G): at grasp, pregrasp and end of the lift."""
-    poses = (T_base_tcp, *_line_ends(prepared, T_base_world, T_base_tcp))
-    return np.array([prepared.robot.is_wrist_within_reach(T, beyond_m) for T in poses])
-
-
-def _is_within_reach(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> Bools:
-    """Whether the TCP is within reach (G,) at the grasp, at the pregrasp and at the end of the lift."""
-    robot, params = prepared.robot, prepared.params
-    to_grasp = T_base_tcp[:, :3, 3] - robot.shoulder_m
-    ways = (0.0, -params.pregrasp_m * T_base_tcp[:, :3, 2], params.lift_m * T_base_world[:3, 2])
-    farthest_m = np.max([np.linalg.norm(to_grasp + way, axis=1) for way in ways], axis=0)
-    return farthest_m <= robot.reach_m
-
-
-def _try_goals(search: _Search, goals: list[_Goal]) -> MotionPlan | None:
+def _try_goals(search: _Search, goals: list[Goal]) -> MotionPlan | None:
     """Search for a plan to some grasps: collisions are checked together, all else one by one.
 
     Grasps that cannot get further than earlier ones are left out.
@@ -205,7 +163,7 @@ def _try_goals(search: _Search, goals: list[_Goal]) -> MotionPlan | None:
     ways = [way for goal in goals for way in _ways(search.scene, goal)]
     if not ways:
         return None
-    search.reached("arm_collision")
+    search.reached("arm_collision", *(way.goal.k for way in ways))
     at = search.at
     if at.is_base_stuck:
         return None
@@ -222,7 +180,7 @@ def _try_goals(search: _Search, goals: list[_Goal]) -> MotionPlan | None:
     return None
 
 
-def _ways(scene: PlanningScene, goal: _Goal) -> list[_Way]:
+def _ways(scene: PlanningScene, goal: Goal) -> list[_Way]:
     """Joints at a grasp and its pregrasp, at most one for each seed."""
     robot = scene.robot
     T_pregrasp = backed(goal.T_base_tcp, scene.params.pregrasp_m)
@@ -244,24 +202,24 @@ def _try_way(search: _Search, way: _Way) -> MotionPlan | None:
     k, T_base_tcp = way.goal.k, way.goal.T_base_tcp
     T_up = np.stack(
         [
-            search.T_base_world @ raised(scene.around.T_world_tcp[k], float(r))
+            search.base.T_base_world @ raised(scene.around.T_world_tcp[k], float(r))
             for r in line_offsets_m(params.lift_m)
         ]
     )
-    search.reached("no_approach")
+    search.reached("no_approach", k)
     T_back = np.stack([backed(T_base_tcp, float(b)) for b in line_offsets_m(params.pregrasp_m)])
     # The end of the lift is checked first: where the arm is too short for it, the lines cost most.
     if way.goal.limit == "no_lift" or robot.ik(T_up[-1], way.q_grasp) is None:
-        search.reached("no_lift")
+        search.reached("no_lift", k)
         return None
     back = follow_line(at, T_back, way.q_grasp, way.q_pregrasp, is_target_held=False)
     if back is None:
         return None
-    search.reached("no_lift")
+    search.reached("no_lift", k)
     lift = follow_line(at, T_up, way.q_grasp, None, is_target_held=True)
     if lift is None:
         return None
-    search.reached("no_path")
+    search.reached("no_path", k)
     homes, opening_m = at.free_homes, float(scene.around.opening_m[k])
     gaps = np.linalg.norm(robot.homes_rad[homes] - way.q_pregrasp, axis=1)
     found = _Reachable(k, back[::-1], lift, homes[np.argsort(gaps, kind="stable")])
@@ -310,6 +268,7 @@ def _plan(search: _Search, found: _Reachable, home: int, q_reach: F64) -> Motion
     some = np.linspace(0, len(q_reach) - 1, _CLEARANCE_POSES).round().astype(np.int64)
     clearance_m = search.at.clearance_m(q_reach[some], opening_m)
     grasp = int(scene.around.grasp[found.k])
+    score = scene.around.grasps.score_of(grasp)
     return MotionPlan(
-        grasp, home, q_reach, found.q_approach_rad, found.q_lift_rad, opening_m, length, clearance_m
+        grasp, home, q_reach, found.q_approach_rad, found.q_lift_rad, opening_m, length, clearance_m, score
     )

@@ -88,18 +88,21 @@ class HandScene:
     GraspSet, each as it is and turned by half a turn about its approach.
     """
 
-    static: Placed  # convex parts of the house near the target
+    hand: Hand
+    T_world_target: F64  # (4, 4)
+    static: Placed  # convex parts of the house around the target
+    near: Placed  # those that the hand can touch, and the other objects
     floor: Bools  # which static parts are low enough for a base to stand on
     objects: Placed  # the target's parts, then those of the other objects
     target_parts: int
-    grasp: Ints  # (K,), row of the GraspSet
+    grasps: GraspSet
+    grasp: Ints  # (K,), row of `grasps`
     T_world_tcp: F64  # (K, 4, 4)
     opening_m: F64  # (K,)
     is_free: FreePoses
     kept: Ints  # rows of the free poses among the grasps that are checked in every scene
     rest: Ints  # rows of the poses of all other grasps, checked on first use
     grasps_free: int  # grasps of `kept`
-    holds: Callable[[int], bool]  # whether a row of the GraspSet holds the object
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,10 +194,14 @@ def hand_scene(
     if len(kept) == 0:
         kept, rest = rest[is_free(rest)], rest[:0]
     return HandScene(
+        hand,
+        T_world_target,
         static,
+        around,
         floor,
         joined([placed_target, *others]),
         len(placed_target),
+        grasps,
         turned.grasp,
         T_world_tcp,
         turned.opening_m,
@@ -202,7 +209,6 @@ def hand_scene(
         kept,
         rest,
         len(np.unique(turned.grasp[kept])),
-        grasps.holds,
     )
 
 

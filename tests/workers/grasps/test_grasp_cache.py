@@ -101,6 +101,19 @@ def test_later_grasps_are_scored_when_asked_for(monkeypatch: pytest.MonkeyPatch)
     assert [grasps.holds(row) for row in (0, known + BLOCK)] == [True, asked[0] >= 0.5]
 
 
+def test_any_pose_can_be_scored() -> None:
+    """A pure function of the object, the hand and the pose."""
+    model = ORDER[0]
+    grasps = grasps_of(model, GRIPPER, GraspParams(per_object=BLOCK))
+    T, opening_m = grasps.T_object_tcp.copy(), grasps.opening_m.astype(np.float64)
+    near = grasps.with_poses(T, opening_m)
+    scores = [near.score_of(row) for row in range(8)]
+    assert np.mean(scores) > 0.5 and all(near.holds(row) == (scores[row] >= 0.5) for row in range(8))
+    assert scores == [near.with_poses(T[row:], opening_m[row:]).score_of(0) for row in range(8)]
+    T[:, :3, 3] += 1.0
+    assert grasps.with_poses(T, opening_m).score_of(0) == 0.0
+
+
 def test_another_draw_gives_other_grasps() -> None:
     model, params = ORDER[0], GraspParams(per_object=BLOCK, min_score=0.0)
     first, other = (grasps_of(model, GRIPPER, params, draw) for draw in (0, 1))

@@ -14,8 +14,9 @@ from datagen.workers.grasps.grasp import GraspSet
 from datagen.workers.houses.house import House, StaticBody
 from datagen.workers.motion.arm_collision import surroundings
 from datagen.workers.motion.grasp_filter import backed, raised
+from datagen.workers.motion.grasp_goals import _nearest_first
 from datagen.workers.motion.motion_plan import MotionPlan, PlanReport
-from datagen.workers.motion.plan_candidate import STAGES, _nearest_first, plan_candidate
+from datagen.workers.motion.plan_candidate import STAGES, plan_candidate
 from datagen.workers.motion.planning_scene import prepare
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes.scene import SettledScene
@@ -210,7 +211,7 @@ def test_grasps_come_nearest_first_however_many_are_looked_at_together(
     table, T = ready.moving.table, T_base_world @ ready.around.T_world_tcp
     ends = [T, backed(T, PARAMS.pregrasp_m), T_base_world @ raised(ready.around.T_world_tcp, PARAMS.lift_m)]
     farthest = np.max([table.distance(end) for end in ends], axis=0)
-    monkeypatch.setattr("datagen.workers.motion.plan_candidate._FILTERED_AT_ONCE", at_once)
+    monkeypatch.setattr("datagen.workers.motion.grasp_goals._FILTERED_AT_ONCE", at_once)
     found = list(_nearest_first(ready, T_base_world, T, table.distance(T)))
     assert 1 < len(found) == np.isfinite(farthest).sum() < len(T)
     assert (np.diff(farthest[found]) >= -1e-9).all()

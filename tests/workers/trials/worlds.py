@@ -58,7 +58,7 @@ def plan_from_above(
         length_rad = sum(
             float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) for path in (reach, approach)
         )
-        return MotionPlan(0, k, reach, approach, up, opening_m, length_rad, 0.05)
+        return MotionPlan(0, k, reach, approach, up, opening_m, length_rad, 0.05, 1.0)
     raise AssertionError("no such grasp: choose a base that reaches it")
 
 
