@@ -59,7 +59,7 @@ def _write(
             tables += [*section, *deeper]
         elif default is None:
             value = [*_words(field.annotation), *_least(field)][0]
-            rows.append(f"# {name} = {_toml(value)}  # absent, or {_comment(field)}")
+            rows.append(f"{mark}# {name} = {_toml(value)}  # absent, or {_comment(field)}")
         else:
             comment = _comment(field)
             rows.append(f"{mark}{name} = {_toml(default)}" + (f"  # {comment}" if comment else ""))

@@ -130,12 +130,13 @@ def test_a_broken_definition_is_one_line(
 
 def test_the_shipped_definition_holds_out_houses_and_objects() -> None:
     shipped = read_benchmark()
-    assert list(shipped.runs) == ["test", "test-known", "grids"]
+    assert list(shipped.runs) == ["test", "test-known", "trials", "grids"]
     assert {run.spec.split for run in shipped.runs.values()} == {"test"}
     assert {name: run.objects for name, run in shipped.runs.items()} == {
-        "test": "test", "test-known": "train", "grids": "test",
+        "test": "test", "test-known": "train", "trials": "test", "grids": "test",
     }  # fmt: skip
     assert [name for name, run in shipped.runs.items() if run.is_of_grids] == ["grids"]
+    assert [name for name, run in shipped.runs.items() if run.spec.label_source == "sim"] == ["trials"]
     assert shipped.runs["test"].spec.objects != shipped.runs["test-known"].spec.objects
 
 

@@ -245,7 +245,7 @@ def test_the_lines_of_the_card_need_nothing_of_this_project(
         block.split("```")[0] for block in page.read_text().split("```python\n")[1:] if "zarr" in block
     ]
     assert len(code.strip().splitlines()) <= 12
-    code = code.replace('("test", "test-known", "grids")', '("test", "grids")')
+    code = code.replace('("test", "test-known", "trials", "grids")', '("test", "grids")')
     (tmp_path / "runs").symlink_to(small_benchmark / "runs")
     alone = "import sys; sys.modules['datagen'] = None\n" + code
     subprocess.run([sys.executable, "-I", "-c", alone], cwd=tmp_path, check=True)
