@@ -16,6 +16,7 @@ from datagen.configuration.specify import parse_toml, read_toml
 from datagen.console.command_lines import Interrupted, print_interrupted, prints
 from datagen.console.options import AllowIncomplete, AsJson, File, PathOrAddress, PathsOrAddresses, Whole
 from datagen.console.printing import print_json, print_rows, seconds
+from datagen.released import checkpoint_file
 from datagen.schemas.errors import InputError, choices
 
 if TYPE_CHECKING:
@@ -106,10 +107,10 @@ def train_model(
 ) -> CheckpointHead:
     """Train a model; the checkpoint records the data, settings and history.
 
-    stage1 trains on heuristic labels with class-weighted cross-entropy; stage2 continues from it on sim or
-    plan labels with cross-entropy and weight decay; sim-only is stage2 from scratch. Training stops when the
-    loss on held-out houses no longer falls, and the best epoch's weights are used. After Ctrl-C, the same
-    command resumes.
+    stage1 trains on heuristic labels with class-weighted cross-entropy; stage2 continues from a checkpoint on
+    sim or plan labels with cross-entropy and weight decay; sim-only is stage2 from scratch. Training stops
+    when the loss on held-out houses no longer falls, and the best epoch's weights are used. After Ctrl-C, the
+    same command resumes.
 
     For example: datagen train stage1 runs/first --out model.ckpt
 
@@ -118,7 +119,7 @@ def train_model(
         runs: Runs to train on; merged and sealed ones too.
         out: Checkpoint to write; the same command resumes it.
         val: Runs for validation [a tenth of the houses is held out].
-        init: Checkpoint of stage 1 (stage2).
+        init: Checkpoint to continue from, of stage 1 or another training, or released (stage2).
         model: Architecture [shared, or that of --init].
         model_config: Sizes of the model: a TOML file, or field=value; repeat for more.
         epochs: Epochs [12 in stage1, else 20].
@@ -163,7 +164,8 @@ def train_model(
 
     chosen = STAGES[stage]
     _refuse_odd_init(stage, init, chosen.from_checkpoint)
-    began = read_checkpoint(init).head if init else None
+    start = None if init is None else checkpoint_file(str(init)) or str(init)
+    began = read_checkpoint(start).head if start else None
     augmentation, effects = read_augmentation(augment)
     options = Options(
         stage=stage,
@@ -187,7 +189,7 @@ def train_model(
         tuple(map(str, val or ())),
         str(out),
         augmentation,
-        str(init) if init else None,
+        start,
         where,
         each,
         tensorboard=None if tensorboard is None else str(tensorboard),
@@ -204,8 +206,9 @@ def train_model(
 
 def _refuse_odd_init(stage: str, init: str | Path | None, needs_one: bool) -> None:
     if init is None and needs_one:
-        problem = f"is missing: {stage} starts from a checkpoint of stage 1"
-        raise InputError("datagen train", "--init", problem, "Give --init CKPT, or train sim-only")
+        problem = f"is missing: {stage} starts from a checkpoint"
+        fix = "Give --init CKPT or --init released, or train sim-only"
+        raise InputError("datagen train", "--init", problem, fix)
     if init is not None and not needs_one:
         problem = f"does not apply: {stage} starts from random weights"
         raise InputError("datagen train", "--init", problem, "Omit it, or train stage2")

@@ -16,6 +16,7 @@ import torch
 
 from datagen import cli
 from datagen.commands.train import model_sizes, read_augmentation, share_cores
+from datagen.released import released_checkpoint
 from datagen.schemas.errors import InputError
 from datagen.train.training.checkpoints import load_model, read_checkpoint
 from datagen.train.training.launching import choose_device
@@ -110,12 +111,25 @@ def test_runs_that_do_not_fit_the_stage_are_refused(
     assert not out.exists()
 
 
+@needs_sim
+def test_the_released_model_is_a_start(sim_run: Path, tmp_path: Path) -> None:
+    """With a rate of nearly nothing its weights stay."""
+    out = tmp_path / "mine.ckpt"
+    assert cli.run(words("stage2", sim_run, out, "--init", "released", "--epochs", "1", "--lr", "1e-12")) == 0
+    released, mine = read_checkpoint(released_checkpoint()), read_checkpoint(out)
+    assert mine.head.init is not None and mine.head.init["digest"] == released.head.digest
+    assert mine.head.model_config == released.head.model_config
+    assert set(released.head.house_ids) < set(mine.head.house_ids)
+    name = next(name for name in released.weights if name.startswith("token"))
+    torch.testing.assert_close(mine.weights[name], released.weights[name])
+
+
 def test_what_cannot_be_trained_is_refused(
     first: Path, heuristic_run: Path, tiny: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     out, run = tmp_path / "c.ckpt", heuristic_run
     cases: list[tuple[list[str], tuple[str, ...]]] = [
-        (words("stage2", run, out), ("--init", "starts from a checkpoint of stage 1")),
+        (words("stage2", run, out), ("--init", "stage2 starts from a checkpoint", "released")),
         (words("stage1", run, out, "--init", str(first)), ("--init", "random weights")),
         (words("stage2", run, out, "--init", tiny), (tiny, "checkpoint")),
         (words("stage1", tmp_path / "none", out), ("none",)),
