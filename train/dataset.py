@@ -7,12 +7,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
+from typing import Annotated, NotRequired
 
 import numpy as np
+from pydantic import Field
 from typing_extensions import TypedDict  # pydantic reads typing's from Python 3.12 on
 
 from datagen.schemas.concurrent_map import concurrent_map
 from datagen.schemas.errors import InputError
+from datagen.schemas.specification import Specification
 from datagen.train.augment import Augmentation
 from datagen.train.batching import (
     SAMPLE_FIELDS,
@@ -89,7 +92,8 @@ class DataOrigin(TypedDict):
 
     `samples_sha256` is over the ids and labels of the selected samples, in stored order: the same for a run,
     its copy and its sealed store. `cost` has the wall and CPU seconds of the whole run; None for a sealed
-    store without its run.
+    store without its run. `robots` has the least and the largest value of `ROBOT_SIZES` in metres; older
+    checkpoints lack it.
     """
 
     spec_hashes: list[str]
@@ -99,6 +103,20 @@ class DataOrigin(TypedDict):
     n_scenes: int
     samples_sha256: str
     cost: dict[str, float] | None
+    robots: NotRequired[dict[str, Annotated[list[float], Field(min_length=2, max_length=2)]]]
+
+
+# Fields of a specification's candidates, in which the robots of a run differ.
+ROBOT_SIZES = ("arm_reach_m", "base_height_m", "camera_height_m")
+
+
+def robot_sizes(specs: Sequence[Specification]) -> dict[str, list[float]]:
+    """The least and the largest of `ROBOT_SIZES` over the robots that specifications draw."""
+    found: dict[str, list[float]] = {}
+    for name in ROBOT_SIZES:
+        ranges = [getattr(spec.candidates, name) for spec in specs]
+        found[name] = [min(r.low for r in ranges), max(r.high for r in ranges)]
+    return found
 
 
 class SampleStream:
@@ -207,6 +225,7 @@ class SampleStream:
                 "n_scenes": summary.scenes,
                 "samples_sha256": summary.samples_sha256,
                 "cost": None if summary.part.cost is None else dict(summary.part.cost),
+                "robots": robot_sizes(summary.part.specs),
             }
             for summary in self.parts
         ]

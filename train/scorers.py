@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -31,12 +32,16 @@ class Scorer(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ModelScorer:
-    """A model's probability of label 1; with `only_clear` 0 where the base is not clear."""
+    """A model's probability of label 1; with `only_clear` 0 where the base is not clear.
+
+    `robots` has the least and the largest sizes of the robots that it was trained on, where they are known.
+    """
 
     model: Model
     name: str
     threshold: float = 0.5
     only_clear: bool = False
+    robots: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
 
     def score(self, batch: Batch[Array]) -> F64:
         """Probabilities (N,); the model divides the candidates to bound memory.

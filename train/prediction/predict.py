@@ -30,6 +30,7 @@ from datagen.train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_t
 from datagen.train.prediction.ground import Ground, find_ground
 from datagen.train.prediction.region_growing import grow_mask
 from datagen.train.prediction.target import Filled, TargetBox, fill_target, locate
+from datagen.train.prediction.trained_robots import robot_notes, trained_robots
 from datagen.train.scorers import ModelScorer, Scorer, scored
 from datagen.workers.geometry.transforms import inverse, yaw_pose
 from datagen.workers.rendering.cloud import Cloud
@@ -170,11 +171,9 @@ def load_scorer(checkpoint: str | Path | None = None) -> ModelScorer:
     # Imported here: frames are read and refused without torch.
     from datagen.train.training.checkpoints import load_model
 
-    if checkpoint is None or checkpoint == RELEASED:
-        model, head = load_model(released_checkpoint())
-        return ModelScorer(model, f"the released model, {head.model} ({head.stage})")
-    model, head = load_model(checkpoint)
-    return ModelScorer(model, f"{head.model} ({head.stage})")
+    which = "the released model, " if checkpoint is None or checkpoint == RELEASED else ""
+    model, head = load_model(released_checkpoint() if which else str(checkpoint))
+    return ModelScorer(model, f"{which}{head.model} ({head.stage})", robots=trained_robots(head))
 
 
 def predict(
@@ -219,7 +218,7 @@ def predict(
     score = scored(scorer, _batch(cloud, target, robot, cells))
     allowed = (CLEAR, UNSEEN) if allow_unseen else (CLEAR,)
     choice = choose(score, cells, allowed, scorer.threshold, arrival)
-    notes = _notes(grounds, filled, cloud)
+    notes = (*_notes(grounds, filled, cloud), *robot_notes(scorer, robot))
     given = (scorer.name, robot, tuple(frames), tuple(grounds))
     return Prediction(*given, seen, target, filled, cloud, cells, score, choice, arrival, notes)
 
