@@ -36,7 +36,7 @@ def report(
     For example: datagen report runs/first model.ckpt evaluation.json --out report.html
 
     Args:
-        paths: Runs, sealed stores, checkpoints, and documents of datagen evaluate --json.
+        paths: Runs, sealed stores, checkpoints or released, and documents of datagen evaluate --json.
         out: Page to write: FILE.html.
         scenes: Scenes to show of each run, the most unusual first.
         seed: Seed of the sample of a large run.

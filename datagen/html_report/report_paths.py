@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from datagen.released import checkpoint_file
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS, RecordSchema, SceneRows
 from datagen.schemas.merged_runs import open_runs
@@ -91,12 +92,12 @@ def open_report_paths(paths: Sequence[str]) -> ReportPaths:
     for path in dict.fromkeys(paths):
         if "://" in path or Path(path).is_dir():
             runs.append((path, _open_run(path)))
-        elif not Path(path).is_file():
+        elif (file := checkpoint_file(path)) is None:
             raise InputError(path, "", "is neither a run's folder nor a file", _FIX)
-        elif _is_json(Path(path)):
-            evaluations.append(Path(path))
+        elif _is_json(Path(file)):
+            evaluations.append(Path(file))
         else:
-            checkpoints.append(Path(path))
+            checkpoints.append(Path(file))
     return ReportPaths(tuple(runs), tuple(checkpoints), tuple(evaluations))
 
 

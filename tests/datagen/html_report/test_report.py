@@ -217,6 +217,10 @@ def test_a_checkpoint_shows_its_training(tmp_path: Path) -> None:
     assert page.tags.count("svg") == 1
 
 
+def test_the_released_model_is_a_checkpoint(tmp_path: Path) -> None:
+    assert "shared, sim-only" in report(tmp_path / "page.html", "released").text
+
+
 @needs_sim
 def test_an_evaluation_has_its_tables(evaluation: Path, tmp_path: Path) -> None:
     page = report(tmp_path / "page.html", evaluation)
