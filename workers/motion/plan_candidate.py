@@ -26,7 +26,7 @@ _STARTS = 3  # tucked poses from which a straight line is tried
 _SEARCHES = 4  # grasps for which a path is searched where no straight path is free
 _SHORTCUTS = 20
 _CLEARANCE_POSES = 8
-# A round of the search near grasps has so many poses, near at most so many.
+# Poses in one round of the search near grasps, and the largest number of grasps that they are near.
 _NEARBY_POSES, _NEARBY_ORIGINS = 1200, 40
 _NEARBY_TRIED = 60  # poses of a round for which IK is tried
 _SAME_RAD = 0.05  # solutions of one grasp that differ by less count as one
@@ -103,7 +103,8 @@ def plan_candidate(
     """Search for a whole plan from the base pose (4, 4) to any grasp except those in `skip`.
 
     `skip` are rows of the GraspSet. The result depends on the arguments alone: neither on earlier candidates
-    nor on time. `rng` is used only where no grasp has a straight path.
+    nor on time. `rng` is used only where no grasp has a straight path. With `nearby_rounds`, poses near the
+    grasps that came furthest follow; `grasp` of such a plan is -1.
     """
     around = prepared.around
     kept, rest = (rows[~np.isin(around.grasp[rows], sorted(skip))] for rows in (around.kept, around.rest))
