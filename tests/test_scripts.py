@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import venv
 from itertools import chain
 from pathlib import Path
 from types import ModuleType
@@ -113,6 +114,25 @@ def test_an_environment_that_has_the_extras_is_left_alone(
     for text in ("", "[]", '{"fingerprint": "other", "extras": ["all"]}'):
         (tmp_path / "stamp").write_text(text)
         assert environment.installed_extras(stamp["fingerprint"]) == set()
+
+
+def test_an_activated_environment_can_be_kept_and_made_again(tmp_path: Path) -> None:
+    """`make` in an activated .venv runs the script with the interpreter that it removes."""
+    place = tmp_path / "environment"
+    venv.create(place, with_pip=False)
+    (place / "old").touch()
+    code = f"""
+import pathlib, runpy, sys
+script = runpy.run_path({str(SCRIPTS / "environment.py")!r}, run_name="loaded")
+script["create"].__globals__["ENVIRONMENT"] = pathlib.Path({str(place)!r})
+print(script["fingerprint"]())
+script["create"]()
+"""
+    python = place / "bin" / "python3"
+    ran = subprocess.run([python, "-c", code], check=True, capture_output=True, text=True)
+    assert ran.stdout.split()[0] == load("environment").fingerprint()
+    assert not (place / "old").exists()
+    subprocess.run([python, "-c", "pass"], check=True)
 
 
 def test_missing_libraries_are_found_and_answered(monkeypatch: pytest.MonkeyPatch) -> None:
