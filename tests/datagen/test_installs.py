@@ -12,8 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from datagen import cli
 from tests.linked_environments import install_wheel, link_libraries, own_files, wheel
-from tests.small_runs import PER_SCENE, make_small_run, submit_arguments
+from tests.sim_extra import needs_sim
+from tests.small_runs import CONFIG, PER_SCENE, make_small_run, submit_arguments
 from tests.train.prediction.checkpoints import write_untrained
 from tests.train.prediction.seen_scenes import draw_seen, write_frame
 
@@ -164,3 +166,18 @@ def test_models_train_and_predict_without_simulators(wheel: Path, tmp_path: Path
     assert helped.code == 0 and trained.code == 0, helped.err + trained.err
     assert predicted.code in (0, 1), predicted.err  # 1 where a model without training finds no good base
     assert (tmp_path / "heat.png").is_file() and (tmp_path / "a.html").is_file()
+
+
+@needs_sim
+def test_models_are_judged_without_simulators(wheel: Path, tmp_path: Path) -> None:
+    train = Installed(wheel, tmp_path, "train")
+    (tmp_path / "plan.toml").write_text(CONFIG + "\n[arm.grasps]\nper_object = 40\n")
+    few = ["--n", "48", "--candidates", "in-range", "--candidates-per-scene", "8", "--workers", "0"]
+    made = ["submit", "plan", *few, "--config", str(tmp_path / "plan.toml"), "--out", str(tmp_path / "plans")]
+    assert cli.run(made) == 0
+    write_untrained(tmp_path / "model.ckpt", {})
+    judge = ["evaluate", "model.ckpt", "plans", "--candidates", "in-range", "--bootstrap", "10"]
+    judged, no_sim = train.run(judge, [*judge, "--baselines", "reachability"])
+    assert judged.code == 0, judged
+    assert "[sim]" in "".join(judged.out.split())  # why `reachability` is left out
+    train.assert_lacks("sim", no_sim)

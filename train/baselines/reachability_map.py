@@ -15,7 +15,6 @@ from functools import lru_cache
 import numpy as np
 
 from datagen.train.inputs import F32, F64
-from datagen.workers.motion.forward_kinematics import forward_kinematics
 from datagen.workers.robots import open_robot, robot_limits
 from datagen.workers.robots.gripper import Gripper
 
@@ -71,6 +70,9 @@ def reachability_map(robot: str, reach_m: float) -> ReachabilityMap:
 
 @lru_cache(maxsize=32)
 def _map(name: str, reach_m: float | None) -> ReachabilityMap:
+    # Of the extra sim, which no other method needs.
+    from datagen.workers.motion.forward_kinematics import forward_kinematics
+
     heights = robot_limits(name).base_height_m
     robot = open_robot(name, reach_m, heights[0] if heights else 0.0)
     kinematics = forward_kinematics(robot)
