@@ -12,13 +12,18 @@ from PIL import Image
 
 from datagen.drawing.floor_plan import draw_labels, draw_outcomes, draw_plan, half_width_m
 from datagen.drawing.scene_picture import Shown
+from datagen.schemas.fields import SceneRows
+from datagen.schemas.specification import Specification
 from datagen.workers.rendering.figures import draw_frame
+from datagen.workers.scenes.reconstruct import reconstruct_scene
+from datagen.workers.world import World
 
 _SIDE_IN, _DPI, _QUALITY = 5.2, 120, 82
 
 
-def scene_pictures(shown: Shown) -> tuple[str, str]:
-    """The frame and the floor plan as `data:` addresses of WebP images."""
+def scene_pictures(world: World, run: str, spec: Specification, rows: SceneRows) -> tuple[str, str]:
+    """The frame and the floor plan of a run's scene as `data:` addresses of WebP images."""
+    shown = Shown(run, spec, rows, reconstruct_scene(world, rows.record))
     frame = _new_figure(0.8 * _SIDE_IN)
     draw_frame(frame.subplots(), shown.frame.rgb, shown.frame.body == 1, "")
     plan = _new_figure(1.08 * _SIDE_IN)

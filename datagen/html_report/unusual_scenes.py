@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from datagen.console.options import AssetSources
-from datagen.drawing.scene_picture import Shown
 from datagen.html_report.measures import scene_measures
 from datagen.html_report.outliers import FEWEST, Measure, Outlier, most_unusual
 from datagen.html_report.part_columns import PartColumns
 from datagen.html_report.report_paths import ReportedPart
-from datagen.html_report.scene_pictures import scene_pictures
 from datagen.html_report.scene_view import VIEW_HELP, scene_view
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
 from datagen.train.html_page import escape, html_facts
 from datagen.workers.extras import missing_library
-from datagen.workers.scenes.reconstruct import reconstruct_scene
-from datagen.workers.world import World, open_world
+
+# Draws a scene's pictures, as addresses of images.
+Painter = Callable[[SceneRows], tuple[str, str]]
 
 _MOST_EACH = 3  # scenes for one measure
 
@@ -30,7 +30,7 @@ def unusual_scenes(
     chosen = most_unusual(measures, count, max(_MOST_EACH, -(-count // len(measures))))
     if not chosen:
         return []
-    world, why = _open_world(columns.part, given)
+    painter, why = _painter(columns.part, given)
     body = [
         f"<p>{escape(_introduction(columns, len(chosen), len(measures)))}</p><p class=note>{VIEW_HELP}</p>"
     ]
@@ -39,7 +39,7 @@ def unusual_scenes(
     by_name = {measure.name: measure for measure in measures}
     for row, outlier in chosen:
         rows = columns.part.scene(int(columns.shard[row]), int(columns.row[row]))
-        body.append(_scene(columns, rows, _reason(by_name[outlier.measure], outlier, columns), world))
+        body.append(_scene(columns, rows, _reason(by_name[outlier.measure], outlier, columns), painter))
         step()
     return body
 
@@ -62,7 +62,7 @@ def _reason(measure: Measure, outlier: Outlier, columns: PartColumns) -> str:
     return f"{measure.name} {measure.text(outlier.value)}, median {median} (z {outlier.score:+.1f})"
 
 
-def _scene(columns: PartColumns, rows: SceneRows, reason: str, world: World | None) -> str:
+def _scene(columns: PartColumns, rows: SceneRows, reason: str, painter: Painter | None) -> str:
     record, label = rows.record, rows.samples["label"]
     index = int(record["scene_index"])
     title = f"Scene {index}: {record['object_name'][0]} on {record['support_type']}, {record['room_type']}"
@@ -72,13 +72,12 @@ def _scene(columns: PartColumns, rows: SceneRows, reason: str, world: World | No
         ("positive", f"{int(label.sum())} of {len(label)} base poses"),
     ]
     pictures = ""
-    if world is not None:
+    if painter is not None:
         try:
-            shown = Shown(columns.part.address, columns.part.spec, rows, reconstruct_scene(world, record))
             names = ("RGB frame, target outlined", "the room from above with the base poses")
             pictures = "".join(
                 f'<figure><img src="{address}" alt="{name}"></figure>'
-                for address, name in zip(scene_pictures(shown), names, strict=True)
+                for address, name in zip(painter(rows), names, strict=True)
             )
         except InputError as error:
             facts.append(("picture", f"cannot be drawn: {error}"))
@@ -89,16 +88,21 @@ def _scene(columns: PartColumns, rows: SceneRows, reason: str, world: World | No
     )
 
 
-def _open_world(part: ReportedPart, given: AssetSources) -> tuple[World | None, str]:
-    """Houses and objects of a part, or None and why they cannot be opened."""
+def _painter(part: ReportedPart, given: AssetSources) -> tuple[Painter | None, str]:
+    """The painter of a part's scenes, or None and why houses and objects cannot be opened or drawn."""
     sources = part.run.manifest.sources if part.run is not None else {}
     houses = given.houses or sources.get("houses", "builtin")
     objects = given.objects or sources.get("objects", "builtin")
     try:
-        return open_world(part.spec, houses, objects), ""
+        # Of the extra labels, which the rest of the page does not need.
+        from datagen.html_report.scene_pictures import scene_pictures
+        from datagen.workers.world import open_world
+
+        world = open_world(part.spec, houses, objects)
     except InputError as error:
         return None, str(error)
     except ImportError as error:
         if (missing := missing_library(error)) is None:
             raise
         return None, str(missing)
+    return partial(scene_pictures, world, part.address, part.spec), ""

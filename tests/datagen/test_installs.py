@@ -158,12 +158,15 @@ def test_models_train_and_predict_without_simulators(wheel: Path, tmp_path: Path
     write_frame(tmp_path / "frame", draw_seen(0))
     robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2", "--grid", "5")
     given = ["--frame", "frame", *robot, "--out", "heat.png", "--html", "a.html"]
-    helped, trained, predicted = train.run(
+    helped, trained, predicted, reported = train.run(
         ["train", "--help"],
         ["train", "stage1", "train", "--val", "val", "--out", "a.ckpt", "--epochs", "1", *MODEL],
         ["predict", "model.ckpt", *given],
+        ["report", "train", "a.ckpt", "--out", "report.html"],
     )
-    assert helped.code == 0 and trained.code == 0, helped.err + trained.err
+    for done in (helped, trained, reported):
+        assert done.code == 0, done
+    assert "Without pictures: " in (tmp_path / "report.html").read_text()
     assert predicted.code in (0, 1), predicted.err  # 1 where a model without training finds no good base
     assert (tmp_path / "heat.png").is_file() and (tmp_path / "a.html").is_file()
 
