@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import json
+import os
 import queue
 import shutil
 import subprocess
@@ -40,9 +41,16 @@ def fingerprint() -> str:
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
     required = {key: pyproject[key] for key in ("build-system", "project")}
     required["setuptools"] = pyproject["tool"]["setuptools"]
-    parts = [sys.version, sys.base_prefix, str(ROOT), json.dumps(required, sort_keys=True)]
+    parts = [sys.version, sys.prefix, str(ROOT), json.dumps(required, sort_keys=True)]
     parts.append((ROOT / "constraints.txt").read_text())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+def leave_environment() -> None:
+    """Go on with the interpreter below .venv where that is activated: its own may be removed here."""
+    if Path(sys.prefix).resolve() == ENVIRONMENT:
+        below = str(getattr(sys, "_base_executable"))  # noqa: B009  the name is private
+        os.execv(below, [below, *sys.argv])
 
 
 def installed_extras(wanted: str) -> set[str]:
@@ -54,22 +62,17 @@ def installed_extras(wanted: str) -> set[str]:
         return set()
 
 
-def base_python() -> str:
-    """This interpreter, or the one below it: where .venv is activated this is its own, which is removed."""
-    return str(getattr(sys, "_base_executable", sys.executable))
-
-
 def create() -> None:
     """Make a bare environment, with pip where this interpreter brings it (Debian's can come without)."""
     shutil.rmtree(ENVIRONMENT, ignore_errors=True)
     if importlib.util.find_spec("ensurepip") is not None:
-        made = subprocess.run([base_python(), "-m", "venv", str(ENVIRONMENT)], check=False)
+        made = subprocess.run([sys.executable, "-m", "venv", str(ENVIRONMENT)], check=False)
         if made.returncode == 0:
             return
         shutil.rmtree(ENVIRONMENT, ignore_errors=True)
     if importlib.util.find_spec("pip") is None:
         sys.exit("error: this python has neither ensurepip nor pip: apt-get install python3-venv")
-    subprocess.run([base_python(), "-m", "venv", "--without-pip", str(ENVIRONMENT)], check=True)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(ENVIRONMENT)], check=True)
 
 
 def pip_command() -> list[str]:
@@ -77,7 +80,7 @@ def pip_command() -> list[str]:
     python = str(ENVIRONMENT / "bin" / "python")
     if any(ENVIRONMENT.glob("lib/python*/site-packages/pip")):
         return [python, "-m", "pip"]
-    return [base_python(), "-m", "pip", "--python", python]
+    return [sys.executable, "-m", "pip", "--python", python]
 
 
 def install(arguments: list[str]) -> bool:
@@ -189,4 +192,5 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    leave_environment()
     sys.exit(main(sys.argv[1:]))

@@ -116,23 +116,25 @@ def test_an_environment_that_has_the_extras_is_left_alone(
         assert environment.installed_extras(stamp["fingerprint"]) == set()
 
 
-def test_an_activated_environment_can_be_kept_and_made_again(tmp_path: Path) -> None:
-    """`make` in an activated .venv runs the script with the interpreter that it removes."""
-    place = tmp_path / "environment"
-    venv.create(place, with_pip=False)
-    (place / "old").touch()
-    code = f"""
-import pathlib, runpy, sys
-script = runpy.run_path({str(SCRIPTS / "environment.py")!r}, run_name="loaded")
-script["create"].__globals__["ENVIRONMENT"] = pathlib.Path({str(place)!r})
-print(script["fingerprint"]())
-script["create"]()
-"""
-    python = place / "bin" / "python3"
-    ran = subprocess.run([python, "-c", code], check=True, capture_output=True, text=True)
-    assert ran.stdout.split()[0] == load("environment").fingerprint()
-    assert not (place / "old").exists()
-    subprocess.run([python, "-c", "pass"], check=True)
+def output_of(*command: str | Path) -> str:
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+def test_in_its_activated_environment_the_interpreter_below_goes_on(tmp_path: Path) -> None:
+    """`make` in an activated .venv: the same fingerprint, and nothing is removed under its feet."""
+    script = tmp_path / "scripts" / "environment.py"
+    script.parent.mkdir()
+    shutil.copy(SCRIPTS / "environment.py", script)
+    for name in ("pyproject.toml", "constraints.txt"):
+        shutil.copy(SCRIPTS.parent / name, tmp_path)
+    venv.create(tmp_path / ".venv", with_pip=False)
+    python = tmp_path / ".venv" / "bin" / "python3"
+    code = f"import runpy; print(runpy.run_path({str(script)!r})['fingerprint']())"
+    below = output_of(python, "-c", "import sys; print(sys._base_executable)").strip()
+    fingerprint = output_of(below, "-c", code).strip()
+    stamp = {"fingerprint": fingerprint, "extras": ["labels"]}
+    (tmp_path / ".venv" / "installed.json").write_text(json.dumps(stamp))
+    assert output_of(python, script, "labels") == "" and python.exists()
 
 
 def test_missing_libraries_are_found_and_answered(monkeypatch: pytest.MonkeyPatch) -> None:
