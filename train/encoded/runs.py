@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import uuid
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -123,11 +124,14 @@ def encode_runs(
     key = digest_of({"version": _VERSION, "tokens": decisive, "samples": samples})
     place = folder / key
     if not place.exists():
-        draft = folder / f".{key}.{os.getpid()}"
+        draft = folder / f".{key}.{uuid.uuid4().hex}"
         draft.mkdir(parents=True)
         try:
             _write(stream, model, draft, seen)
             os.replace(draft, place)
+        except OSError:
+            if not place.exists():  # else another training has made it meanwhile
+                raise
         finally:
             shutil.rmtree(draft, ignore_errors=True)
     return open_encoded(place)

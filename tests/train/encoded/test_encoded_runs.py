@@ -59,6 +59,21 @@ def test_a_model_scores_encoded_candidates_as_it_scores_clouds(heuristic_run: Pa
     np.testing.assert_array_equal(data.in_range, np.concatenate(within))
 
 
+def test_trainings_that_encode_the_same_runs_side_by_side_share_them(tmp_path: Path):
+    run, folder = tmp_path / "run", tmp_path / "encodings"
+    make_stream_run(run, 126)
+    first: list[EncodedRuns] = []
+
+    def overtake(done: int, of: int) -> None:
+        if not first:
+            first.append(encoded(run, folder))
+
+    model = SharedModel(SMALL_SHARED)
+    second = encode_runs(encoded_stream([str(run)], False), model, folder, overtake)
+    assert [place.name for place in folder.iterdir()] == [second.key] == [first[0].key]
+    np.testing.assert_array_equal(second.label, first[0].label)
+
+
 def test_batches_in_any_order_hold_the_scenes_that_were_asked_for(data: EncodedRuns):
     chosen = np.array([17, 3, 9, 4])
     batch = data.batch(chosen)
