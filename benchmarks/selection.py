@@ -37,7 +37,7 @@ from datagen.estimation.mixed_labels import read_whole_scenes
 from datagen.estimation.two_stage_sampling import all_alike, draw_sample
 from datagen.estimation.unsureness import By, design_by, unsureness
 from datagen.frontier.mixtures import MODEL_CONFIG
-from datagen.frontier.points import METRICS, TestSet, mean_over_seeds, measured
+from datagen.frontier.points import METRICS, TestSet, measured
 from datagen.schemas.identity import digest_of
 from datagen.schemas.progress import counting
 from datagen.schemas.run import Run
@@ -46,6 +46,7 @@ from datagen.train.encoded.batches import EncodedBatches
 from datagen.train.encoded.runs import EncodedRuns, encode_runs, encoded_stream
 from datagen.train.encoded.training import Trained, scores_of, train_encoded
 from datagen.train.evaluation.bootstrap import Estimate, resample_weights
+from datagen.train.evaluation.seeds import mean_over_seeds
 from datagen.train.inputs import F32, F64, I64, Array, Bools
 from datagen.train.models.shared import SharedModel
 from datagen.train.training.options import STAGES, Options

@@ -79,7 +79,7 @@ def _record(method: EvaluatedMethod, gathered: Gathered) -> dict[str, Any]:
 def _decisions(columns: Columns, methods: Sequence[Method], resamples: int, seed: int) -> dict[str, Any]:
     """Decisions on the candidates within reach: METRICS with intervals, and calibration."""
     weights = weights_for(columns, resamples, seed)
-    scores = evaluate_set(columns, methods, CANDIDATES, weights)
+    scores = evaluate_set(columns, methods, CANDIDATES, weights, seed=seed)
     rate = scores["positives"] / scores["count"]
     kept = (*METRICS, "expected_calibration_error", "brier")
     return {
@@ -88,6 +88,7 @@ def _decisions(columns: Columns, methods: Sequence[Method], resamples: int, seed
         "positive_rate": rate,
         "base_rate": max(rate, 1 - rate),
         "methods": {name: {key: values[key] for key in kept} for name, values in scores["methods"].items()},
+        "means": [{key: mean[key] for key in ("name", "of", *METRICS)} for mean in scores["means"]],
         "differences": [
             d for d in scores["comparisons"] if d["kind"] == "best" and d["metric"] in METRICS[:2]
         ],
@@ -106,10 +107,11 @@ def _picks(columns: Columns, methods: Sequence[Method], resamples: int, seed: in
             found[name] = None
             continue
         weights = weights_for(part, resamples, seed)
-        scores = evaluate_grids(part, methods, weights)
+        scores = evaluate_grids(part, methods, weights, seed)
         found[name] = {
             **{key: scores[key] for key in ("scenes", "clear_per_scene", "positives_per_scene", "any_clear")},
             "methods": scores["methods"],
+            "means": scores["means"],
             "arrivals": arrival_table(part, methods, weights),
         }
     return found

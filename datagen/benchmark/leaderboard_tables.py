@@ -7,6 +7,7 @@ from typing import Any
 
 from datagen.console.printing import print_rows
 from datagen.evaluation_report.report_tables import (
+    MEANS_NOTE,
     METRIC_WORDS,
     TitledTable,
     metres_with_interval,
@@ -39,6 +40,11 @@ def decisions_table(report: Report, name: str, scores: Report) -> TitledTable:
          percent(values["expected_calibration_error"]), with_interval(values["accuracy"]))
         for method, values in scores["methods"].items()
     ]  # fmt: skip
+    rows += [
+        (mean["name"], with_interval(mean["balanced_accuracy"]), with_interval(mean["area_under_roc"]), "",
+         with_interval(mean["accuracy"]))
+        for mean in scores["means"]
+    ]  # fmt: skip
     rows.append(("the commoner label", "50.0", "50.0", "-", percent(scores["base_rate"])))
     heads = ("method", "balanced accuracy (%)", "AUC (%)", "calibration error (%)", "accuracy (%)")
     about, rate = report["benchmark"]["runs"][name]["about"], percent(scores["positive_rate"])
@@ -67,6 +73,11 @@ def picks_table(report: Report, name: str, which: str, scores: Report) -> Titled
         (method, with_interval(values["good"]), metres_with_interval(values["missed_m"]),
          with_interval(values["mean_average_precision"]))
         for method, values in scores["methods"].items()
+    ]  # fmt: skip
+    rows += [
+        (mean["name"], with_interval(mean["good"]), metres_with_interval(mean["missed_m"]),
+         with_interval(mean["mean_average_precision"]))
+        for mean in scores["means"]
     ]  # fmt: skip
     rows.append(("any clear cell", percent(scores["any_clear"]), "-", percent(scores["any_clear"])))
     heads = ("method", "best cell good (%)", "else missed by (m)", "mAP (%)")
@@ -118,6 +129,8 @@ def facts(report: Report) -> list[tuple[str, str]]:
         ("intervals",
          f"{100 * boot['level']:g}% by {boot['resamples']:,} resamples of scenes, seed {boot['seed']}")
     )  # fmt: skip
+    if any(scores["means"] for scores in report["candidates"].values()):
+        found.append(MEANS_NOTE)
     found.append(("clearance", "every method knows where the base is clear, and predicts negative elsewhere"))
     if report["fitted_on"]:
         found.append(("baselines", f"fitted on {', '.join(report['fitted_on'])}"))

@@ -15,6 +15,7 @@ from datagen.configuration.specify import first_of, read_toml
 from datagen.evaluation_report.evaluated_runs import SCENES_PER_BATCH, EvaluatedRun, refuse_no_trials
 from datagen.released import RELEASED, released_checkpoint
 from datagen.schemas.errors import InputError
+from datagen.schemas.identity import digest_of
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.progress import steps
 from datagen.schemas.specification import HeuristicParams
@@ -66,11 +67,26 @@ class EvaluatedMethod:
         return TrainedBy(self.regime, self.head.model, house_share(self.head))
 
     @property
+    def recipe(self) -> str:
+        """Digest of a training without its seed; "" for baselines and for checkpoints that do not tell it."""
+        head = self.head
+        if head is None or "seed" not in head.options:
+            return ""
+        told = {k: getattr(head, k) for k in ("model", "model_config", "stage", "house_ids", "val_house_ids")}
+        told["options"] = {k: v for k, v in head.options.items() if k != "seed"}
+        told["samples"] = [origin["samples_sha256"] for origin in (*head.data, *head.val_data)]
+        if head.init:  # the stage 1 of each seed is another
+            told["init"] = head.init["stage" if head.init["stage"] == "stage1" else "digest"]
+        return digest_of(told)
+
+    @property
     def method(self) -> Method:
         """The method for the metrics."""
         trained = self.head is not None or isinstance(self.scorer, Scalars)
         is_probability = trained or self.gives_probabilities
-        return Method(self.name, self.scorer.threshold, self.origin, is_probability, self.calibration)
+        return Method(
+            self.name, self.scorer.threshold, self.origin, is_probability, self.calibration, self.recipe
+        )
 
     @property
     def houses(self) -> frozenset[str]:

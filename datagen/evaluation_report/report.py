@@ -90,7 +90,10 @@ def _part(
         covered = columns.of_scenes(np.isin(columns.run, runs))
         weights = weights_for(covered, resamples, seed)
         try:
-            scored[name] = {**evaluate_set(covered, methods, name, weights, objects), "runs": list(runs)}
+            scored[name] = {
+                **evaluate_set(covered, methods, name, weights, objects, seed),
+                "runs": list(runs),
+            }
         except InputError as error:
             if not is_one_of_two:
                 raise
@@ -101,7 +104,7 @@ def _part(
     else:
         whole = columns.of_scenes(columns.is_grid)
         weights = weights_for(whole, resamples, seed)
-        grids = evaluate_grids(whole, methods, weights)
+        grids = evaluate_grids(whole, methods, weights, seed)
         grids["arrivals"] = arrival_table(whole, methods, weights, arrival)
         if grids["scenes"] == grids["scenes_without_positive"]:
             grids, why = None, f"none of {grids['scenes']} whole grids has a positive candidate"

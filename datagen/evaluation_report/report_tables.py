@@ -42,6 +42,9 @@ class TitledTable:
     rows: Sequence[Sequence[str]]
 
 
+MEANS_NOTE = ("means", "over trainings that differ by their seed alone; their intervals hold seeds too")
+
+
 def accuracy_table(report: Report, scores: Report, metrics: Sequence[str] = TABLE_I) -> TitledTable:
     """Return Table I: these metrics of every method, with the paper's accuracy."""
     rows = [
@@ -51,6 +54,10 @@ def accuracy_table(report: Report, scores: Report, metrics: Sequence[str] = TABL
             percent(paper_accuracy(record, report["paper"])),
         )
         for record in report["methods"]
+    ]
+    rows += [
+        (mean["name"], *(with_interval(mean[metric]) for metric in metrics), "-")
+        for mean in scores.get("means", ())  # files of earlier versions have none
     ]
     heads = ("method", *(f"{METRIC_WORDS[metric]} (%)" for metric in metrics), "accuracy in the paper (%)")
     return TitledTable(f"Table I: {candidates_line(scores)}", heads, rows)
@@ -129,6 +136,11 @@ def grids_table(report: Report, grids: Report) -> TitledTable:
         )
         for record in models_first(report["methods"])
     ]
+    rows += [
+        (mean["name"], with_interval(mean["good"]), metres_with_interval(mean["missed_m"]),
+         with_interval(mean["mean_average_precision"]), "-")
+        for mean in grids.get("means", ())
+    ]  # fmt: skip
     paper, chance = report["paper"], percent(grids["any_clear"])
     rows.append(("any clear candidate", chance, "-", chance, "-"))
     rows.append(
@@ -201,6 +213,8 @@ def notes(report: Report) -> list[tuple[str, str]]:
         ("clearance", "every method knows where the base is clear, and predicts negative elsewhere"),
         ("paper", f"{report['paper']['source']}: other houses, arms and candidates"),
     ]
+    if any(scores.get("means") for part in report["parts"] for scores in part["sets"].values()):
+        found.append(MEANS_NOTE)
     if any(record["threshold"] is None for record in report["methods"]):
         found.append(("*", "has no threshold: its choice for each robot is positive, the rest negative"))
     found += [(record["name"], record["note"]) for record in report["methods"] if record["note"]]

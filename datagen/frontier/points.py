@@ -18,6 +18,7 @@ from datagen.train.evaluation.bootstrap import (
     summed,
 )
 from datagen.train.evaluation.metrics import area_under_roc, balanced_accuracy, confusion
+from datagen.train.evaluation.seeds import mean_over_seeds
 from datagen.train.inputs import F32, F64, I64, Bools
 
 METRICS = ("balanced_accuracy", "area_under_roc")
@@ -102,20 +103,6 @@ def measured(metric: str, test: TestSet, scores: F32, weights: Weights) -> Estim
         )
     counts = confusion((score >= _THRESHOLD).astype(np.float64), test.label, test.scene, test.n_scenes)
     return Estimate(float(balanced_accuracy(counts.sum(axis=0))), balanced_accuracy(summed(weights, counts)))
-
-
-def mean_over_seeds(found: Sequence[Estimate], drawn: I64) -> Estimate:
-    """The mean of n seeds; `drawn` (B, n) are the seeds of each resample.
-
-    Resampled means of n seeds vary by a factor sqrt((n - 1) / n) too little, which is corrected. One seed has
-    no variance.
-    """
-    n = len(found)
-    resampled = np.stack([estimate.resamples for estimate in found], axis=1)  # (B, n)
-    mean = resampled.mean(axis=1)
-    spread = np.take_along_axis(resampled, drawn, axis=1).mean(axis=1) - mean
-    wider = np.sqrt(n / (n - 1)) if n > 1 else 0.0
-    return Estimate(float(np.mean([estimate.value for estimate in found])), mean + wider * spread)
 
 
 def efficient(points: Sequence[Point], metric: str) -> list[bool]:

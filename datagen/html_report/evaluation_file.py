@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NotRequired
 
 from pydantic import Field, TypeAdapter, ValidationError
 from typing_extensions import TypedDict  # pydantic reads typing's from Python 3.12 on
@@ -85,6 +85,15 @@ class _SetMethod(TypedDict):
     reliability: list[_Bin] | None
 
 
+class _Mean(TypedDict):
+    name: Text
+    accuracy: _Estimate
+    balanced_accuracy: _Estimate
+    area_under_roc: _Estimate
+    best_pick: _Estimate
+    mean_average_precision: _Estimate
+
+
 class _ClassCounts(TypedDict):
     count: Count
     positives: Count
@@ -110,6 +119,7 @@ class _Set(TypedDict):
     in_reach: _ClassCounts
     out_of_reach: _ClassCounts
     methods: dict[str, _SetMethod]
+    means: NotRequired[list[_Mean]]
     differences: list[_Difference]
     comparisons: list[_Comparison]
     curves: dict[str, _Curves]
@@ -122,11 +132,16 @@ class _GridMethod(TypedDict):
     mean_average_precision: _Estimate
 
 
+class _GridMean(_GridMethod):
+    name: Text
+
+
 class _Grids(TypedDict):
     scenes: Count
     scenes_without_positive: Count
     any_clear: Share | None
     methods: dict[str, _GridMethod]
+    means: NotRequired[list[_GridMean]]
     differences: list[_Difference]
     comparisons: list[_Comparison]
 

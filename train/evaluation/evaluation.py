@@ -24,6 +24,7 @@ from datagen.train.evaluation.bootstrap import (
 from datagen.train.evaluation.columns import Columns
 from datagen.train.evaluation.comparisons import (
     NO_TRAINING,
+    Estimates,
     TrainedBy,
     comparisons,
     differences,
@@ -31,6 +32,7 @@ from datagen.train.evaluation.comparisons import (
     finite,
 )
 from datagen.train.evaluation.grids import picks, select
+from datagen.train.evaluation.seeds import by_recipe, mean_values, means_of
 from datagen.train.inputs import F64, Bools
 from datagen.workers.bases.candidate_sets import DISTANCE_EDGES_M, VISIBILITY_EDGES, Edges, Floats, bands
 
@@ -46,7 +48,8 @@ _RATIO_EDGES: Edges = (0.0, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, None)
 class Method:
     """A method: its name among the scores, its threshold and its training.
 
-    `chances` calibrates scores that are no probabilities.
+    `chances` calibrates scores that are no probabilities. Methods with the same `recipe` are trainings that
+    differ by their seed alone.
     """
 
     name: str
@@ -54,6 +57,7 @@ class Method:
     origin: TrainedBy = NO_TRAINING
     gives_probabilities: bool = False
     chances: Callable[[F64], F64] | None = None
+    recipe: str = ""
 
     @property
     def only_picks(self) -> bool:
@@ -73,8 +77,12 @@ def evaluate_set(
     candidates: str,
     weights: Weights,
     trained_objects: Collection[str] = (),
+    seed: int = 0,
 ) -> dict[str, Any]:
-    """Return the report of one candidate set; `weights` (B, S) resample the scenes of `columns`."""
+    """Return the report of one candidate set; `weights` (B, S) resample the scenes of `columns`.
+
+    `seed` draws the trainings of each resample where some differ by their seed alone.
+    """
     columns = columns.at(columns.is_in(candidates))
     n, positives = len(columns), int(columns.label.sum())
     if not n:
@@ -100,7 +108,7 @@ def evaluate_set(
             for m in methods
         },
         "differences": differences(estimates, METRICS),
-        "comparisons": comparisons(estimates, {m.name: m.origin for m in methods}, METRICS),
+        **_over_seeds(estimates, methods, METRICS, seed),
         "curves": {m.name: _curves(columns.label, columns.scores[m.name]) for m in methods},
         "breakdown": [
             {
@@ -136,7 +144,25 @@ def _estimates(columns: Columns, method: Method, decisions: F64, weights: Weight
     }
 
 
-def evaluate_grids(columns: Columns, methods: Sequence[Method], weights: Weights) -> dict[str, Any]:
+def _over_seeds(
+    estimates: Estimates, methods: Sequence[Method], names: Sequence[str], seed: int
+) -> dict[str, Any]:
+    """Means over trainings that differ by their seed alone, which stand for them in the main comparisons."""
+    alike = by_recipe({m.name: m.recipe for m in methods})
+    means = means_of(estimates, alike, np.random.default_rng([seed, len(methods)]))
+    origins = {m.name: m.origin for m in methods}
+    origins |= {name: origins[members[0]] for name, members in alike.items()}
+    averaged = {member for members in alike.values() for member in members}
+    shown = {name: found for name, found in {**estimates, **means}.items() if name not in averaged}
+    return {
+        "means": mean_values(means, alike),
+        "comparisons": comparisons(shown, {name: origins[name] for name in shown}, names),
+    }
+
+
+def evaluate_grids(
+    columns: Columns, methods: Sequence[Method], weights: Weights, seed: int = 0
+) -> dict[str, Any]:
     """Grid selection: the best clear candidate of each scene; all scenes of `columns` are whole grids."""
     clear = columns.is_clear
     positives = np.bincount(columns.scene, columns.label & clear, columns.n_scenes)
@@ -153,7 +179,7 @@ def evaluate_grids(columns: Columns, methods: Sequence[Method], weights: Weights
             name: {k: estimate_values(e) for k, e in found.items()} for name, found in estimates.items()
         },
         "differences": differences(estimates, GRID_METRICS),
-        "comparisons": comparisons(estimates, {m.name: m.origin for m in methods}, GRID_METRICS),
+        **_over_seeds(estimates, methods, GRID_METRICS, seed),
     }
 
 

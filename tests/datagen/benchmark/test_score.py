@@ -70,6 +70,23 @@ def folder_of_mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def test_trainings_that_differ_by_their_seed_have_a_mean(
+    scored: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seeds = [
+        checkpoint(tmp_path / f"seed{k}.ckpt", options={"seed": k, "lr": 0.1}, cost={"train_cpu_s": k})
+        for k in (1, 2)
+    ]
+    other = checkpoint(tmp_path / "other.ckpt", options={"seed": 3, "lr": 0.2})
+    report = json_of(capsys, ["benchmark", "score", *seeds, other, "proximity", *scored])
+    assert [m["of"] for m in report["candidates"]["test"]["means"]] == [["seed1", "seed2"]]
+    assert [m["of"] for m in report["grids"]["grids"]["mixed"]["means"]] == [["seed1", "seed2"]]
+    assert cli.run(["benchmark", "score", *seeds, *scored]) == 0
+    told = capsys.readouterr().out
+    assert told.count("mean of seed1, seed2") >= 2
+    assert "their intervals hold seeds too" in told
+
+
 def test_every_kind_of_method_has_a_line(
     small_benchmark: Path, scored: list[str], folder_of_mine: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
