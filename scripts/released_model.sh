@@ -12,7 +12,7 @@ ROOT=$(realpath "$(dirname "$0")/..")
 OUT=$(realpath -m "${1:-$ROOT/build/model}")
 LABELS=${LABELS:-200010}  # within reach, in training houses
 EPOCHS=${EPOCHS:-12}
-SCENES=${SCENES:-400}     # whole grids of the closed loop
+SCENES=${SCENES:-150}     # whole grids of the closed loop
 
 need_assets_and_programs
 mkdir -p "$OUT"
