@@ -41,7 +41,7 @@ def decisions_table(report: Report, name: str, scores: Report) -> TitledTable:
         for method, values in scores["methods"].items()
     ]  # fmt: skip
     rows += [
-        (mean["name"], with_interval(mean["balanced_accuracy"]), with_interval(mean["area_under_roc"]), "",
+        (mean["name"], with_interval(mean["balanced_accuracy"]), with_interval(mean["area_under_roc"]), "-",
          with_interval(mean["accuracy"]))
         for mean in scores["means"]
     ]  # fmt: skip

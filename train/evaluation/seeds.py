@@ -18,7 +18,7 @@ def by_recipe(recipes: Mapping[str, str]) -> dict[str, list[str]]:
     for name, recipe in recipes.items():
         if recipe:
             alike.setdefault(recipe, []).append(name)
-    return {f"mean of {', '.join(names)}": names for names in alike.values() if len(names) > 1}
+    return {f"mean of {len(names)} like {names[0]}": names for names in alike.values() if len(names) > 1}
 
 
 def means_of(

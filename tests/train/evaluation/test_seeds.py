@@ -30,15 +30,15 @@ def test_methods_of_one_recipe_are_averaged_in_place_of_their_own_comparisons() 
     weights = weights_for(columns, 200, 0)
     found = evaluate_set(columns, methods, "clear", weights)
     (mean,) = found["means"]
-    assert (mean["name"], mean["of"]) == ("mean of a, b", ["a", "b"])
+    assert (mean["name"], mean["of"]) == ("mean of 2 like a", ["a", "b"])
     for metric in ("balanced_accuracy", "area_under_roc", "accuracy"):
         of_each = [found["methods"][name][metric]["value"] for name in "ab"]
         assert mean[metric]["value"] == pytest.approx(np.mean(of_each))
         assert mean[metric]["low"] <= mean[metric]["value"] <= mean[metric]["high"]
     pairs = {(d["kind"], d["first"], d["second"]) for d in found["comparisons"]}
-    assert ("regimes", "mean of a, b", "other") in pairs
+    assert ("regimes", "mean of 2 like a", "other") in pairs
     assert not {"a", "b"} & {name for _, *names in pairs for name in names}
-    assert [m["name"] for m in evaluate_grids(columns, methods, weights)["means"]] == ["mean of a, b"]
+    assert [m["name"] for m in evaluate_grids(columns, methods, weights)["means"]] == ["mean of 2 like a"]
     assert evaluate_set(columns, methods[1:], "clear", weights)["means"] == []
 
 
