@@ -38,6 +38,8 @@ LINES = ("--", "-.", ":")
 _MOST_METHODS = 5
 _PANEL_IN = 2.55
 _MOST_CHARACTERS = 60  # of a name: a longer one leaves no room for axes
+# In the legend of the curves, with its value in brackets: longer ones would run into the next curves' legend.
+_LONGEST_IN_TWO_COLUMNS = 17
 _TRUTH = ListedColormap(CELL_COLOURS)
 _REACH_COLOUR = "#1b3a6b"
 GRIDS_CAPTION = (
@@ -136,8 +138,11 @@ def draw_curves(report: Report, scores: Report) -> Figure:
         (reliability, "reliability (Brier score)", "mean predicted probability", "observed share of good"),
     ):
         ax.set(title=title, xlabel=x, ylabel=y, xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
-        if ax.get_legend_handles_labels()[0]:
-            ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, ncols=2)
+        if labels := ax.get_legend_handles_labels()[1]:
+            columns = 2 if max(map(len, labels)) <= _LONGEST_IN_TWO_COLUMNS else 1
+            ax.legend(
+                fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, ncols=columns
+            )
     return figure
 
 

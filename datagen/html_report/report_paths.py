@@ -102,6 +102,8 @@ def open_report_paths(paths: Sequence[str]) -> ReportPaths:
 
 
 def _is_json(path: Path) -> bool:
+    if path.suffix.lower() == ".json":  # even where it is empty
+        return True
     try:
         with open(path, "rb") as file:
             return file.read(64).lstrip()[:1] in (b"{", b"[")

@@ -296,6 +296,7 @@ def test_broken_evaluations_are_refused_by_field(
         (["{file}"], "not a datagen checkpoint"),
         (["{json}"], "Field required"),
         (["{text}"], "is not JSON"),
+        (["{nothing}"], "is not JSON"),
         (["{run}", "--scenes", "51"], "--scenes"),
         (["{run}", "--seed", "-1"], "--seed"),
         (["{run}", "--out", "page.png"], "is not a .html or .htm file"),
@@ -309,6 +310,8 @@ def test_bad_input_is_one_line(
     named = {**places, "run": reported, "json": folder / "a.json", "text": folder / "b.json"}
     named["json"].write_text('{"methods": 3}')
     named["text"].write_text("{" + "[" * 5000)
+    named["nothing"] = folder / "c.json"
+    named["nothing"].write_text("")
     out = [] if "--out" in words else ["--out", str(folder / "page.html")]
     refused(["report", *(word.format(**named) for word in words), *out], capsys, said)
     assert not (folder / "page.html").exists()
