@@ -49,7 +49,7 @@ def _only(report: dict[str, Any], name: str, record: dict[str, Any]) -> dict[str
 
     def cut(value: Any) -> Any:
         if isinstance(value, dict):
-            known = {k: cut(v) for k, v in value.items() if k != "differences"}
+            known = {k: cut(v) for k, v in value.items() if k not in ("differences", "means")}
             if isinstance(methods := known.get("methods"), dict):
                 known["methods"] = {released.RELEASED: methods[name]}
             return known

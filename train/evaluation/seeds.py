@@ -55,4 +55,5 @@ def mean_over_seeds(found: Sequence[Estimate], drawn: I64) -> Estimate:
     mean = resampled.mean(axis=1)
     spread = np.take_along_axis(resampled, drawn, axis=1).mean(axis=1) - mean
     wider = np.sqrt(n / (n - 1)) if n > 1 else 0.0
-    return Estimate(float(np.mean([estimate.value for estimate in found])), mean + wider * spread)
+    value = float(np.mean([estimate.value for estimate in found]))
+    return Estimate(value, mean + wider * spread, found[0].trials)

@@ -42,6 +42,11 @@ def test_methods_of_one_recipe_are_averaged_in_place_of_their_own_comparisons() 
     assert evaluate_set(columns, methods[1:], "clear", weights)["means"] == []
 
 
+def test_a_mean_of_perfect_seeds_keeps_the_exact_interval_of_a_share() -> None:
+    perfect = Estimate(1.0, np.ones(50), trials=20)
+    assert mean_over_seeds([perfect, perfect], np.zeros((50, 2), np.int64)).interval() == perfect.interval()
+
+
 def test_methods_without_a_recipe_are_never_averaged() -> None:
     assert by_recipe({"a": "", "b": "", "c": "r"}) == {}
 
