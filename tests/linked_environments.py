@@ -17,9 +17,8 @@ from packaging.requirements import Requirement
 from datagen.workers.extras import DISTRIBUTION
 from tests.conftest import REPOSITORY, once
 
-# The subpackages, which were import names of their own once, and names that every library has.
+# Names of subpackages and of libraries.
 OWN_FILES = ("train", "workers", "schemas", "cluster", "tests", "datagen", "numpy", "zarr")
-PACKAGES = ("cluster", "datagen", "schemas", "train", "workers")
 
 
 @pytest.fixture(scope="session")
@@ -39,8 +38,7 @@ def build_wheel(folder: Path) -> None:
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(REPOSITORY / name, source)
     ignore = shutil.ignore_patterns("__pycache__")
-    for name in PACKAGES:
-        shutil.copytree(REPOSITORY / name, source / name, symlinks=True, ignore=ignore)
+    shutil.copytree(REPOSITORY / "datagen", source / "datagen", ignore=ignore)
     options = ["-q", "--no-deps", "--no-build-isolation", "-w", str(folder)]
     command = [sys.executable, "-m", "pip", "wheel", *options, str(source)]
     subprocess.run(command, check=True, env={**os.environ, "PIP_NO_INDEX": "1"})

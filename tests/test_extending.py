@@ -46,9 +46,7 @@ def extended(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
     for kind, place, code in blocks():
         if kind == "file":
             if not place.startswith("tests/"):
-                modules[place] = executed(
-                    monkeypatch, "datagen." + place.removesuffix(".py").replace("/", "."), code
-                )
+                modules[place] = executed(monkeypatch, place.removesuffix(".py").replace("/", "."), code)
             continue
         assert code.count("\n") == 1, f"more than one line for {place}"
         module, registry = place.split(":")
@@ -60,7 +58,10 @@ def extended(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
 
 
 def test_each_example_is_one_file_one_line_and_one_test() -> None:
-    shape = [(kind, re.split(r"[/.]", place.removeprefix("datagen."))[0]) for kind, place, _ in blocks()]
+    shape = [
+        (kind, re.split(r"[/.]", place.removeprefix("datagen.").removeprefix("datagen/"))[0])
+        for kind, place, _ in blocks()
+    ]
     assert shape == [("file", "workers"), ("line", "workers"), ("file", "tests")] * 4
     assert PAGE.read_text().count("```python") == len(shape)  # no block escapes this test
     for kind, place, _ in blocks():

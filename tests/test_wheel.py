@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -64,13 +63,6 @@ def test_a_wheel_has_the_benchmark_the_model_and_its_frame(wheel: Path) -> None:
             if path.is_file() and path.suffix != ".pyc":
                 assert sizes[str(path.relative_to(REPOSITORY))] == path.stat().st_size
     assert sum(released.values()) < 5_500_000
-
-
-def test_the_folders_of_a_checkout_cannot_be_imported_under_their_own_names() -> None:
-    for name in ("cluster", "schemas", "train", "workers"):
-        command = [sys.executable, "-c", f"import {name}"]
-        run = subprocess.run(command, cwd=REPOSITORY, capture_output=True, check=False)
-        assert f"import it as datagen.{name}".encode() in run.stderr
 
 
 @needs_sim

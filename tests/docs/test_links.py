@@ -17,7 +17,7 @@ PAGES = sorted(
     for page in REPOSITORY.glob(pattern)
 )
 # Where code, tests and files for users name documents. The changelog names those of its time.
-FOLDERS = ("benchmarks", "cluster", "datagen", "docs", "schemas", "scripts", "tests", "train", "workers")
+FOLDERS = ("benchmarks", "datagen", "docs", "scripts", "tests")
 
 _FENCED = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")

@@ -1,0 +1,1 @@
+"""Execution of shards: the driver loop, its policy, and the executors."""

@@ -1,0 +1,1 @@
+"""The data on disk: specification, records, fields, stores, checks and merges; and errors."""

@@ -1,0 +1,1 @@
+"""Training, evaluation and prediction: everything that reads runs to learn from them."""

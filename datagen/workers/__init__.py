@@ -1,0 +1,1 @@
+"""Computation of shards: geometry, labels and simulators, without Ray and storage."""
