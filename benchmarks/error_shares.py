@@ -27,8 +27,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from datagen.display.progress import counting
 from datagen.schemas.cost import StageClock
-from datagen.schemas.progress import counting
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scenes
 from datagen.train.encoded.batches import EncodedBatches

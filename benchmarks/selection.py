@@ -33,13 +33,13 @@ import numpy as np
 import torch
 
 from benchmarks.selection_costs import Costs, kinds_of, measured_costs
+from datagen.display.progress import counting
 from datagen.estimation.mixed_labels import read_whole_scenes
 from datagen.estimation.two_stage_sampling import all_alike, draw_sample
 from datagen.estimation.unsureness import By, design_by, unsureness
 from datagen.frontier.mixtures import MODEL_CONFIG
 from datagen.frontier.points import METRICS, TestSet, measured
 from datagen.schemas.identity import digest_of
-from datagen.schemas.progress import counting
 from datagen.schemas.run import Run
 from datagen.schemas.whole_files import whole_file
 from datagen.train.encoded.batches import EncodedBatches

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.repeatability import Labelling, label_scene, stored_scenes
+from datagen.display.progress import counting
 from datagen.schemas.outcomes import OUTCOMES
-from datagen.schemas.progress import counting
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_committed
 from datagen.schemas.whole_files import whole_file

@@ -22,11 +22,11 @@ from datagen.cluster.stop_request import StopRequest, stop_on_signals
 from datagen.cluster.task import AttemptResult
 from datagen.configuration.manifest import manifest_of
 from datagen.configuration.stored_scenes import StoredScenes, specify_again
+from datagen.display.progress import Progress
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import sample_ids
 from datagen.schemas.keys import MERGED, part_folder, shard_folder
-from datagen.schemas.progress import Progress
 from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record, publish, refuse_foreign, utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, FileEntry, Merged

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from datagen.console.printing import print_rows
+from datagen.display.html_page import escape, html_facts, html_page, html_table
 from datagen.evaluation_report.report_tables import (
     MEANS_NOTE,
     METRIC_WORDS,
@@ -16,7 +17,6 @@ from datagen.evaluation_report.report_tables import (
 )
 from datagen.train.evaluation.arrival_success import PICKS
 from datagen.train.evaluation.grids import HARD_SHARE
-from datagen.train.html_page import escape, html_facts, html_page, html_table
 
 Report = Mapping[str, Any]
 

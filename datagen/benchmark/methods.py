@@ -9,11 +9,11 @@ from pathlib import Path
 
 from datagen.benchmark.python_scorers import REFERENCE, import_scorer
 from datagen.benchmark.score_files import read_scores
+from datagen.display.progress import Progress
 from datagen.evaluation_report.evaluated_runs import EvaluatedRun
 from datagen.evaluation_report.methods import EvaluatedMethod, baseline_methods, open_models
 from datagen.released import RELEASED, released_checkpoint
 from datagen.schemas.errors import InputError
-from datagen.schemas.progress import Progress
 from datagen.train.baselines import BASELINES
 
 _RUNS = "runs the code of"

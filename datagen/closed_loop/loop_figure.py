@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from datagen.evaluation_report.figures import looks_of, new_figure, plain
+from datagen.display.figures import new_figure, plain
+from datagen.evaluation_report.figures import looks_of
 from datagen.train.evaluation.arrival_success import PICKS
 from datagen.train.evaluation.closed_loop import AT_RANDOM, BY_LABELS
 

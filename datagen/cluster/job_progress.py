@@ -13,7 +13,7 @@ from datagen.cluster.run_forecast import RunForecast, shown_range
 from datagen.cluster.shard_costs import Interval
 from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import AttemptReport
-from datagen.schemas.progress import Pace, Progress, clock_text, whole
+from datagen.display.progress import Pace, Progress, clock_text, whole
 
 StopMode = Literal["drain", "force"]
 

@@ -13,11 +13,11 @@ from cyclopts import Parameter
 
 from datagen.console.options import AllowIncomplete, AsJson, Whole, refuse_odd_draws, refuse_output
 from datagen.console.printing import print_json, print_rows
+from datagen.display.progress import steps
 from datagen.evaluation_report.report_tables import with_interval
 from datagen.reports.specification_summary import specification_record
 from datagen.schemas.errors import InputError, one_line, printable
 from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.progress import steps
 from datagen.schemas.specification import HeuristicParams, Specification
 from datagen.workers.bases.candidate_sets import CANDIDATE_SETS, in_set
 

@@ -22,8 +22,8 @@ from datagen.console.options import (
     refuse_odd_draws,
 )
 from datagen.console.printing import print_json
+from datagen.display.progress import counting
 from datagen.schemas.errors import InputError
-from datagen.schemas.progress import counting
 from datagen.schemas.whole_files import whole_file
 
 _MOST_REPEATS, _MOST_WORKERS = 1000, 256

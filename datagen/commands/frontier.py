@@ -14,9 +14,9 @@ from cyclopts import Parameter
 from datagen.console.command_lines import print_interrupted
 from datagen.console.options import AllowIncomplete, AsJson, Whole, refuse_odd_draws
 from datagen.console.printing import print_json
+from datagen.display.progress import counting
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.progress import counting
 from datagen.schemas.whole_files import whole_file
 
 if TYPE_CHECKING:

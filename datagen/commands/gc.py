@@ -10,10 +10,10 @@ from typing import Any
 from datagen.cluster.run_recorder import refresh_index
 from datagen.console.options import AsJson, RunPath
 from datagen.console.printing import print_json, print_rows, size
+from datagen.display.progress import counting
 from datagen.schemas.errors import InputError
 from datagen.schemas.garbage_collection import KINDS, Garbage, Seen, Swept, find_garbage, sweep
 from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.progress import counting
 from datagen.schemas.storage import Storage, open_storage
 
 _AGE = re.compile(r"([0-9]{1,9})(s|m|h|d)")

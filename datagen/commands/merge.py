@@ -11,13 +11,13 @@ from cyclopts import Parameter
 from datagen.console.command_lines import command_line, prints, resumable, words_of
 from datagen.console.options import AsJson, PathOrAddress
 from datagen.console.printing import print_json, print_rows, seconds
+from datagen.display.progress import steps
 from datagen.jobs.options import absolute_path
 from datagen.reports.spending import account_for
 from datagen.schemas.lineage import lineage_summary
 from datagen.schemas.merged_runs import label_counts, open_runs
 from datagen.schemas.merging import MergePlan, MergeResult, merge_runs, plan_merge
 from datagen.schemas.merging.writing import WrittenUnion
-from datagen.schemas.progress import steps
 from datagen.schemas.run import Run
 
 _WORDS = {

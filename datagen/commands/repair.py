@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 from datagen.commands.verify import finding_row, print_findings
 from datagen.console.options import AS_FOUND, AsJson, RunPath, Sources, Whole
 from datagen.console.printing import counted, listed, print_json, print_rows
+from datagen.display.progress import counting
 from datagen.schemas.checking.repair import RegenerateShard, Repaired, repair_runs
 from datagen.schemas.errors import InputError
-from datagen.schemas.progress import counting
 from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage
 

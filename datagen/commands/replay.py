@@ -11,6 +11,7 @@ from cyclopts import Parameter
 from datagen.configuration.arms import refuse_missing_packages
 from datagen.console.options import AS_FOUND, AsJson, RunPath, Sources, Whole, refuse_output
 from datagen.console.printing import print_json, print_rows
+from datagen.display.progress import Step, steps
 from datagen.drawing.replay_picture import draw_replay
 from datagen.drawing.scene_picture import Shown
 from datagen.regeneration.scenes import (
@@ -26,7 +27,6 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.identity import sample_ids
 from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.progress import Step, steps
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scene
 from datagen.schemas.selection import keys_of

@@ -19,6 +19,7 @@ from datagen.configuration.stored_scenes import (
 )
 from datagen.console.command_lines import prints, words_of
 from datagen.console.options import File, PathOrAddress, Whole
+from datagen.display.progress import Progress
 from datagen.estimation.selected_candidates import SelectBy, SelectOptions, select_candidates
 from datagen.jobs.detach import detach_job
 from datagen.jobs.dry_run import PlannedRun, dry_run
@@ -37,7 +38,6 @@ from datagen.released import checkpoint_file
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED
-from datagen.schemas.progress import Progress
 from datagen.schemas.record_files import refuse_other
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout, Manifest

@@ -12,10 +12,10 @@ import numpy as np
 
 from datagen.console.options import AS_FOUND, AsJson, RunPath, Sources, Whole
 from datagen.console.printing import counted, print_json, print_lines, print_rows, seconds, size
+from datagen.display.progress import counting
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
 from datagen.schemas.errors import InputError, printable
-from datagen.schemas.progress import counting
 from datagen.schemas.run import Run
 from datagen.schemas.storage import Storage, open_storage
 

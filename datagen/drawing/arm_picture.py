@@ -10,6 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from datagen.display.figures import draw_frame, new_sheet, save_sheet, write_facts
+from datagen.display.styles import BEST, BEST_BY_SCORE, Style
 from datagen.drawing.floor_plan import (
     Handle,
     draw_legend,
@@ -22,8 +24,6 @@ from datagen.drawing.floor_plan import (
 from datagen.drawing.grasp_views import draw_grasps, support_sheet, used_grasps
 from datagen.drawing.scene_picture import Columns, Lines, Shown, best_clear, positives, scene_facts
 from datagen.schemas.outcomes import OUTCOMES
-from datagen.schemas.styles import BEST, BEST_BY_SCORE, Style
-from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts
 from datagen.workers.robots import open_robot
 
 if TYPE_CHECKING:  # the heuristic's pictures need no library of arms

@@ -14,9 +14,9 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from datagen.display.styles import LABEL_STYLES, TARGET
 from datagen.reports.agreement_tables import name_of, set_name
 from datagen.reports.error_map import CELL_M, HALF_CELLS
-from datagen.schemas.styles import LABEL_STYLES, TARGET
 
 MIN_COUNT = 5  # a share of fewer candidates is not drawn
 _FEW, _NONE = "#b9b9b9", "#ececf1"

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from PIL import ImageColor
 
+from datagen.display.styles import TARGET
 from datagen.drawing.film_camera import Shot, Subject, choose_shot, nothing, scaled_camera
 from datagen.drawing.posed_robot import RobotBodies
-from datagen.schemas.styles import TARGET
 from datagen.workers.geometry.mesh import F64, U8
 from datagen.workers.rendering.embree_renderer import cast_pixels
 from datagen.workers.rendering.frame import Camera

@@ -9,8 +9,8 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
+from datagen.display.styles import PHASE_COLOURS
 from datagen.drawing.film import OUTLINE_RGB, Film, pictures
-from datagen.schemas.styles import PHASE_COLOURS
 from datagen.workers.geometry.mesh import U8
 
 # Sizes of the far and the near view, (width, height), of a sheet and of an animation.

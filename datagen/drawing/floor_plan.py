@@ -16,8 +16,7 @@ from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 
-from datagen.schemas.outcomes import OUTCOMES
-from datagen.schemas.styles import (
+from datagen.display.styles import (
     BEST,
     CAMERA,
     CLUTTER,
@@ -27,6 +26,7 @@ from datagen.schemas.styles import (
     TARGET,
     Style,
 )
+from datagen.schemas.outcomes import OUTCOMES
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import convex_hull
 from datagen.workers.houses.house import StaticBody

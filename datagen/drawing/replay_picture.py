@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from datagen.display.figures import draw_frame, new_sheet, save_sheet
+from datagen.display.styles import LABEL_STYLES, SAMPLE, Style
 from datagen.drawing.floor_plan import (
     Handle,
     draw_labels,
@@ -18,8 +20,6 @@ from datagen.drawing.floor_plan import (
     object_outlines,
 )
 from datagen.drawing.scene_picture import Shown
-from datagen.schemas.styles import LABEL_STYLES, SAMPLE, Style
-from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet
 from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 

@@ -12,6 +12,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from mpl_toolkits.mplot3d import Axes3D
 
+from datagen.display.figures import draw_frame, new_sheet, save_sheet, write_facts
+from datagen.display.styles import BEST_BY_SCORE, TARGET
 from datagen.drawing.floor_plan import (
     draw_labels,
     draw_legend,
@@ -24,8 +26,6 @@ from datagen.schemas.fields import SceneRows
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.specification import Specification
-from datagen.schemas.styles import BEST_BY_SCORE, TARGET
-from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts
 from datagen.workers.rendering.frame import Frame
 from datagen.workers.scenes.generate import render_frame
 from datagen.workers.scenes.reconstruct import ReconstructedScene

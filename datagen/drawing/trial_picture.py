@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from datagen.display.styles import OUTCOME_STYLES
 from datagen.drawing.arm_picture import best_success
 from datagen.drawing.film import Film, Moments, filmstrip_moments
 from datagen.drawing.filmstrip import (
@@ -24,7 +25,6 @@ from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.specification import Specification
-from datagen.schemas.styles import OUTCOME_STYLES
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse

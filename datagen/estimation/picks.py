@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from datagen.display.progress import counting
 from datagen.estimation.mixed_labels import MixedLabels
 from datagen.evaluation_report.evaluated_runs import SCENES_PER_BATCH
 from datagen.evaluation_report.methods import EvaluatedMethod, open_models
 from datagen.released import checkpoint_file
 from datagen.schemas.errors import InputError, choices
-from datagen.schemas.progress import counting
 from datagen.train.baselines import BASELINES, FIELDS, make_baselines
 from datagen.train.dataset import SampleStream
 from datagen.train.evaluation.grids import picks

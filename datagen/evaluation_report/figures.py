@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
-from datagen.evaluation_report.report_tables import METRIC_WORDS, Report, paper_accuracy
-from datagen.schemas.errors import printable
-from datagen.schemas.styles import (
+from datagen.display.figures import new_figure, plain
+from datagen.display.styles import (
     BASELINE_COLOURS,
     BASELINE_MARKERS,
     BEST,
@@ -28,6 +24,7 @@ from datagen.schemas.styles import (
     SCORE_COLOURS,
     TARGET,
 )
+from datagen.evaluation_report.report_tables import METRIC_WORDS, Report, paper_accuracy
 from datagen.train.evaluation.columns import Columns, Example
 from datagen.train.evaluation.grids import picks
 
@@ -37,7 +34,6 @@ _SHOWN = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick")
 LINES = ("--", "-.", ":")
 _MOST_METHODS = 5
 _PANEL_IN = 2.55
-_MOST_CHARACTERS = 60  # of a name: a longer one leaves no room for axes
 # In the legend of the curves, with its value in brackets: longer ones would run into the next curves' legend.
 _LONGEST_IN_TWO_COLUMNS = 17
 _TRUTH = ListedColormap(CELL_COLOURS)
@@ -144,29 +140,6 @@ def draw_curves(report: Report, scores: Report) -> Figure:
                 fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, ncols=columns
             )
     return figure
-
-
-def plain(text: str) -> str:
-    """The text as matplotlib shows it: of bounded length, control characters escaped, without formulas."""
-    shown = printable(text)
-    shown = shown if len(shown) <= _MOST_CHARACTERS else shown[: _MOST_CHARACTERS - 3] + "..."
-    return shown.replace("$", r"\$")
-
-
-def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure with constrained layout."""
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
-    FigureCanvasSVG(figure)
-    return figure
-
-
-def svg_of(figure: Figure, name: str) -> str:
-    """The `<svg>` element; `name` makes its ids unique on the page."""
-    text = io.StringIO()
-    with mpl.rc_context({"svg.hashsalt": name, "svg.fonttype": "path"}):
-        figure.savefig(text, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
-    whole = text.getvalue()
-    return whole[whole.index("<svg") :]
 
 
 def draw_examples(

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from datagen.configuration.specify import first_of, read_toml
+from datagen.display.progress import steps
 from datagen.evaluation_report.evaluated_runs import SCENES_PER_BATCH, EvaluatedRun, refuse_no_trials
 from datagen.released import RELEASED, released_checkpoint
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
 from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.progress import steps
 from datagen.schemas.specification import HeuristicParams
 from datagen.train.baselines import BASELINES, FIELDS, fit_baselines, make_baselines
 from datagen.train.baselines.calibration import Calibration, calibrate

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from datagen.display.figures import svg_of
+from datagen.display.html_page import escape, html_facts, html_figure, html_page, html_table
 from datagen.evaluation_report import report_tables as tables
 from datagen.evaluation_report.figures import (
     GRIDS_CAPTION,
     draw_curves,
     draw_examples,
     draw_intervals,
-    svg_of,
 )
 from datagen.evaluation_report.report_tables import Report, TitledTable
 from datagen.train.evaluation.columns import Gathered
-from datagen.train.html_page import escape, html_facts, html_figure, html_page, html_table
 
 
 def page_of(report: Report, gathered: Gathered) -> str:

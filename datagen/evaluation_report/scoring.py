@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from datagen.display.progress import counting
 from datagen.evaluation_report.evaluated_runs import EvaluatedRun
 from datagen.evaluation_report.methods import EvaluatedMethod
-from datagen.schemas.progress import counting
 from datagen.train.evaluation.columns import Gathered, gather
 
 

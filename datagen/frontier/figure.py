@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from datagen.display.styles import MODEL_COLOURS, MODEL_MARKERS
 from datagen.frontier.points import METRICS, Point, efficient
-from datagen.schemas.styles import MODEL_COLOURS, MODEL_MARKERS
 
 _WORDS = {"balanced_accuracy": "balanced accuracy within reach (%)", "area_under_roc": "AUC within reach (%)"}
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from matplotlib.figure import Figure
 
 from datagen.console.printing import counted, seconds
-from datagen.evaluation_report.figures import new_figure, svg_of
-from datagen.schemas.styles import MODEL_COLOURS
-from datagen.train.html_page import html_facts, html_figure, html_table
+from datagen.display.figures import new_figure, svg_of
+from datagen.display.html_page import html_facts, html_figure, html_table
+from datagen.display.styles import MODEL_COLOURS
 
 if TYPE_CHECKING:
     from datagen.train.training.checkpoints import CheckpointHead

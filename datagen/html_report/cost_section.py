@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from datagen.console.printing import seconds, size
+from datagen.display.html_page import escape, html_facts, html_table
 from datagen.reports.agreement_tables import band_name, name_of, percent, set_name
-from datagen.train.html_page import escape, html_facts, html_table
 
 Numbers = Mapping[str, Any]
 

@@ -10,6 +10,8 @@ from typing import Any
 from datagen import __version__
 from datagen.console.options import AssetSources
 from datagen.console.printing import counted, seconds
+from datagen.display.html_page import escape, html_page
+from datagen.display.progress import steps
 from datagen.evaluation_report.page import about, sources_of, tables_of
 from datagen.evaluation_report.report_tables import percent
 from datagen.html_report.checkpoint_section import checkpoint_section, read_head
@@ -21,8 +23,6 @@ from datagen.html_report.part_columns import chosen_shards, read_columns
 from datagen.html_report.report_paths import ReportPaths
 from datagen.html_report.run_section import PartReport, run_section, state_words
 from datagen.html_report.scene_view import SCRIPT, STYLE
-from datagen.schemas.progress import steps
-from datagen.train.html_page import escape, html_page
 
 _MOST_FINDINGS = 12
 _STYLE = f"""{STYLE}

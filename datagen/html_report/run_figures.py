@@ -13,10 +13,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from datagen.evaluation_report.figures import new_figure
+from datagen.display.figures import new_figure
+from datagen.display.styles import LABEL_STYLES, SCORE_COLOURS
 from datagen.html_report.outliers import THRESHOLD, Measure
 from datagen.html_report.part_columns import F64, Array, PartColumns
-from datagen.schemas.styles import LABEL_STYLES, SCORE_COLOURS
 
 Bools = npt.NDArray[np.bool_]
 

@@ -10,7 +10,8 @@ from typing import Any
 
 from datagen.console.options import AssetSources
 from datagen.console.printing import counted, listed
-from datagen.evaluation_report.figures import svg_of
+from datagen.display.figures import svg_of
+from datagen.display.html_page import escape, html_facts, html_figure, html_table
 from datagen.html_report.measures import shard_measures
 from datagen.html_report.outliers import FEWEST, THRESHOLD, Measure, Outlier, outliers_of
 from datagen.html_report.part_columns import PartColumns
@@ -24,7 +25,6 @@ from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.quarantine import lifted_records
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Manifest, QuarantineRecord
-from datagen.train.html_page import escape, html_facts, html_figure, html_table
 
 _MOST_OUTLIERS, _MOST_QUARANTINED = 20, 50
 

@@ -10,11 +10,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from datagen.display.figures import draw_frame
 from datagen.drawing.floor_plan import draw_labels, draw_outcomes, draw_plan, half_width_m
 from datagen.drawing.scene_picture import Shown
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.specification import Specification
-from datagen.workers.rendering.figures import draw_frame
 from datagen.workers.scenes.reconstruct import reconstruct_scene
 from datagen.workers.world import World
 

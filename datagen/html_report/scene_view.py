@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from datagen.display.html_page import escape
+from datagen.display.styles import LABEL_STYLES, TARGET
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.outcomes import OUTCOMES
-from datagen.schemas.styles import LABEL_STYLES, TARGET
-from datagen.train.html_page import escape
 
 SCRIPT = files("datagen.html_report").joinpath("scene_view.js").read_text(encoding="utf-8")
 STYLE = """

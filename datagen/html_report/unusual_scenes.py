@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 
 from datagen.console.options import AssetSources
+from datagen.display.html_page import escape, html_facts
 from datagen.html_report.measures import scene_measures
 from datagen.html_report.outliers import FEWEST, Measure, Outlier, most_unusual
 from datagen.html_report.part_columns import PartColumns
@@ -13,7 +14,6 @@ from datagen.html_report.report_paths import ReportedPart
 from datagen.html_report.scene_view import VIEW_HELP, scene_view
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
-from datagen.train.html_page import escape, html_facts
 from datagen.workers.extras import missing_library
 
 # Draws a scene's pictures, as addresses of images.

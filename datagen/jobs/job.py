@@ -26,13 +26,13 @@ from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.stop_request import StopRequest, stop_on_signals
 from datagen.cluster.task import Executor, ShardTask
 from datagen.console.command_lines import command_line
+from datagen.display.progress import Progress
 from datagen.jobs.evidence import made_here
 from datagen.jobs.job_report import JobResult
 from datagen.jobs.options import JOBS_API, SUBMISSION, JobOptions
 from datagen.reports.specification_summary import made_from
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, JobState, new_job_id
-from datagen.schemas.progress import Progress
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal

@@ -17,10 +17,10 @@ from datagen.cluster.ray_cluster import refuse_unusable
 from datagen.console.beginning import beginning_s
 from datagen.console.command_lines import resumable, words_of
 from datagen.console.options import Whole
+from datagen.display.progress import Progress
 from datagen.jobs.budget_option import parse_budget
 from datagen.reports.prices import read_prices
 from datagen.schemas.errors import InputError, refuse_not_utf8
-from datagen.schemas.progress import Progress
 from datagen.workers.extras import refuse_missing
 
 DEFAULT_SHARE = 0.01

@@ -11,7 +11,7 @@ from datagen.cluster.job_progress import JobProgress, TimeLeft
 from datagen.cluster.job_totals import JobTotals
 from datagen.cluster.run_forecast import RunForecast
 from datagen.cluster.task import AttemptReport
-from datagen.schemas.progress import Progress
+from datagen.display.progress import Progress
 from datagen.schemas.run_records import Cost
 from tests.cluster.simulated import FakeClock
 

@@ -10,10 +10,10 @@ import pytest
 from PIL import Image, ImageColor, ImageSequence
 
 from datagen import cli
+from datagen.display.styles import OUTCOME_STYLES
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scene
-from datagen.schemas.styles import OUTCOME_STYLES
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
 from datagen.workers.world import open_world
 from tests.refusals import refused

@@ -23,7 +23,7 @@ from datagen.cluster.retry_policy import RetryPolicy
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.stop_request import StopRequest, stop_on_signals
 from datagen.cluster.task import AttemptResult
-from datagen.schemas.progress import Progress
+from datagen.display.progress import Progress
 from datagen.schemas.run import Run
 from tests.made_runs import write
 

@@ -9,8 +9,8 @@ import plotly.graph_objects as go
 from plotly.colors import get_colorscale
 from plotly.io import to_html
 
-from datagen.schemas.styles import BEST, SCORE_COLOURS, TARGET
-from datagen.train.html_page import html_facts, html_figure, html_page
+from datagen.display.html_page import html_facts, html_figure, html_page
+from datagen.display.styles import BEST, SCORE_COLOURS, TARGET
 from datagen.train.inputs import I64
 from datagen.train.prediction.base_cells import STATES
 from datagen.train.prediction.pictures import robot_lines, shown_rows

@@ -15,12 +15,12 @@ from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.path import Path
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-from datagen.schemas.styles import BEST, CAMERA, SCORE_COLOURS, TARGET
+from datagen.display.figures import draw_frame, new_sheet, save_sheet, write_facts
+from datagen.display.styles import BEST, CAMERA, SCORE_COLOURS, TARGET
 from datagen.train.inputs import F64
 from datagen.train.prediction.base_cells import BLOCKED, CLEAR, STATES, UNREACHABLE, UNSEEN
 from datagen.train.prediction.predict import Prediction
 from datagen.train.prediction.prediction_report import report_rows
-from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts
 
 _EDGE = {CLEAR: "#222222", UNSEEN: "none", BLOCKED: "none", UNREACHABLE: "none"}
 _ALPHA = {CLEAR: 1.0, UNSEEN: 0.6, BLOCKED: 0.9, UNREACHABLE: 0.9}

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from datagen.display.progress import Pace, Progress, clock_text, whole
 from datagen.schemas.errors import InputError
-from datagen.schemas.progress import Pace, Progress, clock_text, whole
 from datagen.workers.extras import how_to_get
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from datagen.display.progress import Progress, Seen
 from datagen.schemas.errors import InputError
-from datagen.schemas.progress import Progress, Seen
 from datagen.train.augment import Augmentation
 from datagen.train.dataset import SampleStream
 from datagen.train.encoded.batches import EncodedBatches

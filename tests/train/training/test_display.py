@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from datagen.display.progress import Progress
 from datagen.schemas.errors import InputError
-from datagen.schemas.progress import Progress
 from datagen.train.training.callbacks import TensorBoardCallback, TrainingProgress, TrainingStep
 from tests.cluster.simulated import FakeClock
 

@@ -1,4 +1,4 @@
-"""Sheets of pictures: figures of one width in true colour, frames with outlined targets, lines of facts."""
+"""Figures: sheets as PNG, drawings of pages as SVG, frames with outlined targets, lines of facts."""
 
 from __future__ import annotations
 
@@ -8,15 +8,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
+import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from PIL import Image
 
-from datagen.schemas.styles import TARGET
+from datagen.display.styles import TARGET
+from datagen.schemas.errors import printable
 
 _WIDTH_IN = 11.0  # at 800 pixels, as pages show pictures, text of 10 points is then 10 pixels high
 _DPI = 120
+_MOST_CHARACTERS = 60  # in a name: a longer one leaves no room for axes
 
 
 def new_sheet(title: str, height_in: float) -> Figure:
@@ -54,3 +58,26 @@ def write_facts(axes: Axes, facts: Sequence[tuple[str, str]], head_characters: i
         for head, text in facts
     ]
     axes.text(0, 1, "\n".join(lines), va="top", family="monospace", fontsize=9, transform=axes.transAxes)
+
+
+def plain(text: str) -> str:
+    """The text as matplotlib shows it: of bounded length, control characters escaped, without formulas."""
+    shown = printable(text)
+    shown = shown if len(shown) <= _MOST_CHARACTERS else shown[: _MOST_CHARACTERS - 3] + "..."
+    return shown.replace("$", r"\$")
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure with constrained layout."""
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasSVG(figure)
+    return figure
+
+
+def svg_of(figure: Figure, name: str) -> str:
+    """The `<svg>` element; `name` makes its ids unique on the page."""
+    text = io.StringIO()
+    with mpl.rc_context({"svg.hashsalt": name, "svg.fonttype": "path"}):
+        figure.savefig(text, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    whole = text.getvalue()
+    return whole[whole.index("<svg") :]

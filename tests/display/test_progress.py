@@ -10,7 +10,7 @@ from collections.abc import Callable
 import pytest
 from rich.console import Console
 
-from datagen.schemas.progress import Pace, Progress, clock_text, counting, steps
+from datagen.display.progress import Pace, Progress, clock_text, counting, steps
 from tests.cluster.simulated import FakeClock
 
 

@@ -9,8 +9,7 @@ import pytest
 from matplotlib import colormaps
 from matplotlib.colors import to_hex, to_rgb
 
-from datagen.schemas.outcomes import OUTCOMES
-from datagen.schemas.styles import (
+from datagen.display.styles import (
     BASELINE_COLOURS,
     BASELINE_MARKERS,
     CELL_COLOURS,
@@ -24,6 +23,7 @@ from datagen.schemas.styles import (
     SCORE_COLOURS,
     TARGET,
 )
+from datagen.schemas.outcomes import OUTCOMES
 
 # What dichromats see, on linear RGB, at full severity (Machado, Oliveira, Fernandes 2009).
 EYES = {
