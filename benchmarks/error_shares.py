@@ -31,14 +31,17 @@ from datagen.display.progress import counting
 from datagen.schemas.cost import StageClock
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scenes
-from datagen.train.encoded.batches import EncodedBatches
-from datagen.train.encoded.runs import EncodedRuns, encode_runs, encoded_stream
-from datagen.train.encoded.training import scores_of, train_encoded
+from datagen.train.encoded_runs import EncodedBatches, EncodedRuns, encode_runs, encoded_stream
 from datagen.train.evaluation.bootstrap import resample_weights, resampled_area_under_roc
 from datagen.train.evaluation.metrics import area_under_roc
 from datagen.train.inputs import F32, F64, Array, Bools
+from datagen.train.models import Model, build_model
 from datagen.train.models.hand_poses import HAND_WIDTH, N_MEASURES
 from datagen.train.models.shared import SharedModel
+from datagen.train.tensors import to_torch
+from datagen.train.training.launching import Ranks
+from datagen.train.training.loop import Position, Training, run_training
+from datagen.train.training.optimiser import make_optimiser
 from datagen.train.training.options import STAGES, Options
 from datagen.workers.labels.arm_labelling import arm_in_scene
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
@@ -165,16 +168,36 @@ def trained(
             "sim-only", "shared", config, epochs, lr=stage.lr, weight_decay=stage.weight_decay, seed=seed
         )
         scenes = np.arange(round(share * len(train.houses)))
-        made = train_encoded(
+        model = _train(
             options,
             EncodedBatches(train, scenes, options.batch_scenes, seed),
             EncodedBatches(val, np.arange(len(val.houses)), options.batch_scenes),
-            None,
-            lambda: False,
         )
-        assert made is not None
-        scores.append(scores_of(made.model, test))
+        scores.append(_scores(model, test))
     return np.asarray(np.mean(scores, axis=0, dtype=np.float64))
+
+
+def _train(options: Options, train: EncodedBatches, val: EncodedBatches) -> Model:
+    """The model with its best weights."""
+    torch.manual_seed(options.seed)
+    model = build_model(options.model, options.model_config)
+    optimiser = make_optimiser(model, options.lr, options.weight_decay)
+    position = Position()
+    training = Training(options, model, optimiser, train, val, torch.ones(2), position, Ranks())
+    run_training(training, lambda: None)
+    model.load_state_dict(position.best_weights)
+    return model.eval()
+
+
+def _scores(model: Model, encoded: EncodedRuns) -> F32:
+    """Probabilities (N,) of label 1 of all candidates."""
+    found: list[F32] = []
+    with torch.inference_mode():
+        for batch in EncodedBatches(encoded, np.arange(len(encoded.houses)), 32).epoch(0):
+            given = to_torch(batch, "cpu")
+            logits = model.score(given.clouds, given.candidates, given.robots).double()
+            found.append(torch.softmax(logits, dim=1)[:, 1].float().numpy())
+    return np.concatenate(found)
 
 
 def show(rows: dict[str, F64], good: Bools, scene: Array) -> None:

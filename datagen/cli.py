@@ -57,7 +57,6 @@ VERBS: dict[str, tuple[str, str]] = {
     "calibrate": ("datagen.commands.calibrate:calibrate", "Fit the heuristic's parameters to trial labels."),
     "audit": ("datagen.commands.audit:audit", "Show the cost of labels by stage, and of 180,000."),
     "report": ("datagen.commands.report:report", "Write one HTML page about runs and models."),
-    "estimate": ("datagen.commands.estimate:estimate", "Estimate success rates from mixed labels."),
     "gc": ("datagen.commands.gc:gc", "Remove leftover files of a run."),
     "show": ("datagen.commands.show:show", "Draw a picture of one scene of a run."),
     "train": ("datagen.commands.train:train_model", "Train a model on labels."),
@@ -67,7 +66,6 @@ VERBS: dict[str, tuple[str, str]] = {
         "Execute methods' picks with arrival errors.",
     ),
     "benchmark": ("datagen.commands.benchmark:app", "Make and score the frozen benchmark."),
-    "frontier": ("datagen.commands.frontier:frontier", "Compare label sources by accuracy and cost."),
     "predict": ("datagen.commands.predict:predict", "Find a base pose in a depth camera's frame."),
     "doctor": ("datagen.doctor:doctor", "Check this machine, and show how to fix what is missing."),
     "assets": ("datagen.assets.cli:app", "List, fetch, lock, verify and split houses and objects."),
@@ -75,15 +73,15 @@ VERBS: dict[str, tuple[str, str]] = {
 
 _HEADINGS = {
     "Make labels": ("submit", "resume", "extend", "cancel", "merge", "relabel"),
-    "Look at runs": ("status", "logs", "show", "audit", "report", "estimate"),
+    "Look at runs": ("status", "logs", "show", "audit", "report"),
     "Check and keep runs": ("verify", "repair", "replay", "seal", "unseal", "gc"),
-    "Models": ("train", "evaluate", "benchmark", "closed-loop", "frontier", "predict", "calibrate"),
+    "Models": ("train", "evaluate", "benchmark", "closed-loop", "predict", "calibrate"),
     "This machine": ("doctor", "assets"),
 }
 
 # The extra to name for a verb where several extras contain the missing library.
 _EXTRA_OF: dict[str, str] = dict.fromkeys(
-    ("train", "evaluate", "benchmark", "closed-loop", "frontier", "predict", "calibrate"), "train"
+    ("train", "evaluate", "benchmark", "closed-loop", "predict", "calibrate"), "train"
 )
 
 

@@ -21,7 +21,6 @@ Run format {FORMAT_VERSION}. A run is a folder (or an object-store prefix):
 ```
 RUN/
   manifest.json                  specification, hash, schema version, layout; written once
-  selection.json                 of a run of selected candidates: which, and their probabilities
   plans/<k>.json                 samples wanted; the highest k counts, a run only grows
   shards/<shard>/<attempt>/      an immutable, flat Zarr v3 group with the rows of one shard
   commits/<shard>.json           written last, create-only: attempt, digests of files, cost
@@ -64,10 +63,6 @@ Attributes: `units` (SI, `1` for numbers without one), `long_name`, `frame`, `va
 `title`, `summary`, `source`, `license` and `acknowledgement` of the assets, `references`, `history` and
 `comment`. Its arrays also have `coordinates`, and `flag_values` with `flag_meanings`. Stores that an older
 program sealed lack these attributes and remain valid; sealing again adds them.
-
-A run of selected candidates ([estimate](../guides/estimate.md#select)) also stores `selection_probability`
-(float64) for each sample: the probability with which the candidate, its scene included, was selected. Its
-`scene_index` and `candidate_index` are those of the run that it was selected from.
 
 [Read the data](../guides/read-data.md) opens a store; [Python](../guides/python.md#tables-of-candidates)
 joins samples and scenes to a table.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from contextlib import contextmanager
 from functools import lru_cache
 
@@ -13,7 +13,7 @@ from datagen.schemas.keys import commit_key
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
-from datagen.schemas.selection import rows_to_label
+from datagen.schemas.scene_rows import read_scenes
 from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.storage.errors import FORBIDDEN, FULL, machine_error
 from datagen.workers.robots import gripper_of
@@ -33,12 +33,8 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
         run.ledger.start(task.attempt, task.shard)
         if run.storage.exists(commit_key(task.shard)):  # by another driver, while this attempt was queued
             return AttemptResult(False, 0, 0, meter.cost())
-    scenes: Sequence[int] = task.scene_indices
-    stored = None
-    if scenes_run is not None:
-        labelled = list(rows_to_label(run, scenes_run, scenes))
-        scenes, stored = [index for index, _ in labelled], [rows for _, rows in labelled]
-    made = run_shard(task.spec, world, scenes, stored, run.schema.version)
+    stored = None if scenes_run is None else list(read_scenes(scenes_run, task.scene_indices))
+    made = run_shard(task.spec, world, task.scene_indices, stored, run.schema.version)
     with ends_job(), made.clock.stage("write"):
         files = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
         entries = run.write_shard(task.shard, task.attempt, files, ours=True)

@@ -37,12 +37,7 @@ def extend(run: RunPath, /, *, n: Whole, given: Sources = AS_FOUND, **job: Unpac
     def wanted_of(job_runs: Sequence[JobRun]) -> list[int]:
         wanted = longer([job_run.run for job_run in job_runs], n, run)
         for job_run, more in zip(job_runs, wanted, strict=True):
-            selection = job_run.run.manifest.spec.selection
-            if selection is not None and more > job_run.run.n:
-                problem = f"{job_run.run.storage.url} has no more selected candidates"
-                fix = "Select others into another run with `datagen submit --candidates-from`"
-                raise InputError("--n", str(n), problem, fix)
-            if job_run.scenes_from and selection is None:
+            if job_run.scenes_from:
                 stored = StoredScenes(Run.open(job_run.scenes_from), job_run.houses, job_run.objects)
                 refuse_too_few(stored, job_run.run.layout, more)
         return wanted

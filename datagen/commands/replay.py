@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from cyclopts import Parameter
 
 from datagen.configuration.arms import refuse_missing_packages
@@ -29,7 +30,6 @@ from datagen.schemas.identity import sample_ids
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scene
-from datagen.schemas.selection import keys_of
 from datagen.workers.scenes.reconstruct import reconstruct_scene
 
 _PREFIX_AT_LEAST = 6
@@ -126,8 +126,7 @@ def find_sample(runs: list[Run], text: str, step: Step = lambda: None) -> tuple[
 
 
 def _ids(run: Run, scene: int, count: int) -> list[bytes]:
-    index, candidates = keys_of(run, scene)
-    ids = sample_ids(run.manifest.spec_hash, index, candidates[:count])
+    ids = sample_ids(run.manifest.spec_hash, scene, np.arange(count, dtype=np.int32))
     return [row.tobytes() for row in ids]
 
 

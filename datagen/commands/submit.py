@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal, Unpack
 
@@ -20,7 +19,6 @@ from datagen.configuration.stored_scenes import (
 from datagen.console.command_lines import prints, words_of
 from datagen.console.options import File, PathOrAddress, Whole
 from datagen.display.progress import Progress
-from datagen.estimation.selected_candidates import SelectBy, SelectOptions, select_candidates
 from datagen.jobs.detach import detach_job
 from datagen.jobs.dry_run import PlannedRun, dry_run
 from datagen.jobs.job import JobRun
@@ -34,14 +32,12 @@ from datagen.jobs.options import (
     refuse_odd_n,
 )
 from datagen.jobs.start_job import planned_run, refuse_unusable_engines, start_job
-from datagen.released import checkpoint_file
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED
 from datagen.schemas.record_files import refuse_other
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout, Manifest
-from datagen.schemas.selection import Selection, selection_of
 from datagen.schemas.storage import open_storage
 from datagen.workers.houses import open_houses
 from datagen.workers.labels import load_label_source
@@ -72,10 +68,6 @@ def submit(
     houses: str | None = None,
     objects: str | None = None,
     scenes_from: PathOrAddress | None = None,
-    candidates_from: PathOrAddress | None = None,
-    select: SelectBy | None = None,
-    model: Annotated[Sequence[str | Path] | None, Parameter(metavar="PATH...")] = None,
-    random_share: float = 0.2,
     robot: str | None = None,
     perturb: Whole | None = None,
     candidates: Literal["grid", "clear", "in-range"] | None = None,
@@ -91,6 +83,9 @@ def submit(
 ) -> JobResult:
     """Make labels: start a run, or resume the run in the folder.
 
+    To train a model, make plan labels with --candidates in-range; to repeat the paper, heuristic labels; to
+    measure success in physics, sim labels.
+
     The same command on the same folder resumes the run, and a larger --n extends it; other options are
     refused with the fields that differ. Ctrl-C finishes the running attempts, a second Ctrl-C stops at once;
     committed shards are kept.
@@ -104,16 +99,10 @@ def submit(
         houses: builtin, procthor:DIR or ai2thor:DIR [builtin].
         objects: builtin or ycb:DIR [builtin].
         scenes_from: Run whose scenes and candidates are labelled again.
-        candidates_from: Run from whose candidates n are selected and labelled (plan, sim).
-        select: Rule of the selection: nearest to the model's threshold (margin), in proportion to its entropy
-            (uncertain), or where model and stored label differ (disagree) [random].
-        model: Checkpoints for the selection, or released; several: their mean.
-        random_share: Share of the selection that is random, so that each candidate has a chance.
         robot: fetch, panda, panda-scaled or xarm7; sets reach and height [plan, sim: panda-scaled].
         perturb: Arrivals per candidate, with random errors of pose; in sim also of the world [1, without].
         candidates: Cells to sample from: all, those with a clear base, or those also within reach [grid].
-        candidates_per_scene: Candidates sampled per scene from the 25x25 grid, or grid for all 625 [60];
-            with --candidates-from, those selected in each selected scene [a quarter].
+        candidates_per_scene: Candidates sampled per scene from the 25x25 grid, or grid for all 625 [60].
         robots_per_scene: Robots that share a scene's candidates [4; 1 on a whole grid].
         split: Split of the houses; splits share no house [all].
         seed: Seed of the whole run [0].
@@ -139,22 +128,6 @@ def submit(
         (True, 8, True)
     """
     out, job_options = str(out), JobOptions(**job)
-    if candidates_from is not None and scenes_from is not None:
-        problem = "labels selected candidates, but --scenes-from all of them"
-        raise InputError("--candidates-from", str(candidates_from), problem, "Give one of the two")
-    selecting = None
-    if candidates_from is not None:
-        chosen = _per_scene(None if candidates_per_scene is None else str(candidates_per_scene))
-        if chosen == "grid":
-            fix = "Give a number, or label all candidates with --scenes-from"
-            raise InputError("--candidates-per-scene", "grid", "is no selection", fix)
-        models = [str(path) for path in model or ()]
-        per_scene = chosen if isinstance(chosen, int) else None
-        selecting = SelectOptions(select, models, per_scene, random_share, seed or 0)
-        selecting.refuse_bad(label_source)
-    elif select is not None or model:
-        option = "--select" if select is not None else "--model"
-        raise InputError(option, "", "selects nothing without --candidates-from", "Name the run there")
     scenes_from = None if scenes_from is None else str(scenes_from)
     config = None if config is None else Path(config)
     refuse_missing_packages(label_source)
@@ -167,8 +140,6 @@ def submit(
         "--houses": houses and absolute_source(houses),
         "--objects": objects and absolute_source(objects),
         "--scenes-from": scenes_from and absolute_path(scenes_from),
-        "--candidates-from": candidates_from and absolute_path(str(candidates_from)),
-        "--select": select,
         "--robot": robot,
         "--perturb": perturb,
         "--candidates": candidates,
@@ -182,10 +153,6 @@ def submit(
         "--config": config and config.expanduser().absolute(),
     }
     words = ["submit", label_source, *words_of(given), *job_options.words()]
-    if selecting is not None:
-        for path in selecting.models:
-            words += ["--model", str(Path(checkpoint_file(path) or path).expanduser().absolute())]
-        words += ["--random-share", str(random_share)]
     if job_options.detach and job_options.address != "local":
         return detach_job(words, out, job_options)  # its sources are paths on the cluster
     options = {
@@ -198,9 +165,7 @@ def submit(
         "observation.noise.enabled": True if noise else None,
     }
     with opening(words, job_options) as began_s:
-        selection = None
-        stored_in = scenes_from or (None if candidates_from is None else str(candidates_from))
-        if stored_in is None:
+        if scenes_from is None:
             houses, objects = houses or "builtin", objects or "builtin"
             house_source, object_source = open_houses(houses), open_objects(objects)
             spec = specify(label_source, house_source, object_source, options, config, robot, perturb)
@@ -210,35 +175,24 @@ def submit(
                 _refuse_no_scene(world, houses)
             source_url, layout, schema_version = "", layout_of(spec, n), None
         else:
-            of_selection = () if selecting is None else ("--seed", "--candidates-per-scene")
-            stored = open_stored_scenes(
-                stored_in,
-                houses,
-                objects,
-                {name: given[name] for name in _OF_SCENES if name not in of_selection},
-            )
+            of_scenes = {name: given[name] for name in _OF_SCENES}
+            stored = open_stored_scenes(scenes_from, houses, objects, of_scenes)
             spec = specify_again(label_source, stored, config, robot, perturb)
             houses, objects = stored.houses, stored.objects
             world = open_world(spec, houses, objects)
             refuse_unusable_engines(spec, job_options.address)
             source_url, schema_version = stored.run.storage.url, stored.run.manifest.schema_version
-            if selecting is None:
-                layout = _existing_layout(out) or layout_again(spec, stored, n)
-                selection = selection_of(stored.run)
-                refuse_too_few(stored, layout, n)
-            else:
-                existing = _existing_run(out)
-                selected = select_candidates(spec, stored, n, selecting, existing, job_options.json)
-                spec, layout, n, selection = selected.spec, selected.layout, selected.n, selected.record
+            layout = _existing_layout(out) or layout_again(spec, stored, n)
+            refuse_too_few(stored, layout, n)
         sources = {"houses": absolute_source(houses), "objects": absolute_source(objects)}
         sources |= {"n_houses": str(len(world.house_ids)), "n_objects": str(len(world.object_names))}
         if source_url:
             sources["scenes_from"] = source_url
         manifest = manifest_of(spec, layout, sources, schema_version)
-        planned = _planned(out, manifest, n, selection) if job_options.dry_run else None
+        planned = _planned(out, manifest, n) if job_options.dry_run else None
         run = None
         if planned is None:
-            run = Run.create_or_open(open_storage(out), manifest, n, selection)
+            run = Run.create_or_open(open_storage(out), manifest, n)
     if given["--houses"] is None and not source_url:
         Progress(job_options.json).say("note", {"note": _BUILTIN}, _BUILTIN)
     if planned is not None:
@@ -252,13 +206,13 @@ def submit(
     )
 
 
-def _planned(out: str, manifest: Manifest, n: int, selection: Selection | None) -> PlannedRun:
+def _planned(out: str, manifest: Manifest, n: int) -> PlannedRun:
     """The shards that the run at `out`, or a new one, lacks. InputError for another specification there."""
     sources = manifest.sources
     references = sources["houses"], sources["objects"], sources.get("scenes_from", "")
     run = _existing_run(out)
     if run is None:
-        return PlannedRun(manifest, None, n, manifest.layout.shards_for(n), *references, selection)
+        return PlannedRun(manifest, None, n, manifest.layout.shards_for(n), *references)
     refuse_other(run.storage.url, run.manifest, manifest)
     return planned_run(JobRun(run, *references), max(n, run.n))
 

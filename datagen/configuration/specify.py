@@ -103,7 +103,7 @@ def specify(
 def read_fields(config: Path | None) -> dict[str, Any]:
     """The fields of the file. Raises InputError for those that only the command line may set."""
     fields = read_toml(config) if config else {}
-    for reserved in ("label_source", "houses", "objects", "engines", "scenes_from", "selection"):
+    for reserved in ("label_source", "houses", "objects", "engines", "scenes_from"):
         if reserved in fields:
             raise InputError(
                 config or "", reserved, "cannot be set in this file", "Give it on the command line instead"

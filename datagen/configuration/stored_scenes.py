@@ -86,7 +86,7 @@ def specify_again(
             raise InputError(place, section, problem, "Remove the section")
     for name, value in (options or {}).items():
         put_field(chosen, name, value, config)
-    fields = before.model_dump(mode="json", exclude_none=True, exclude={"selection"})
+    fields = before.model_dump(mode="json", exclude_none=True)
     arm = fields.pop("arm", {})
     # The robot and its planning stay; disturbances are chosen for each run.
     arm.pop("disturbance", None)
@@ -102,8 +102,7 @@ def specify_again(
         "scenes_from": {"spec_hash": before.scenes_hash},
         "engines": engines | label_engines(label_source),
     }
-    # A run of selected candidates keeps its selection.
-    spec = validated(fields, place).model_copy(update={"selection": before.selection})
+    spec = validated(fields, place)
     if suited is not None:
         fix = f"Make the scenes with `datagen submit heuristic --robot {suited}`, or choose another robot"
         refuse_unsuited(spec, suited, stored.run.storage.url, fix)

@@ -19,7 +19,6 @@ from datagen.reports.prices import read_prices
 from datagen.reports.specification_summary import made_from
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Manifest
-from datagen.schemas.selection import Selection
 
 # Seconds from the opened sources to the first shard of a job on Ray, where no pilot has measured it.
 _RAY_START_S = 5.0
@@ -36,7 +35,6 @@ class PlannedRun:
     houses: str  # source references, absolute
     objects: str
     scenes_from: str = ""
-    selection: Selection | None = None  # the candidates to label; None: all
 
 
 def dry_run(path: str, planned: Sequence[PlannedRun], job_options: JobOptions, began_s: float) -> JobResult:
@@ -99,8 +97,7 @@ def _evidence(path: str, planned: PlannedRun, job_options: JobOptions, began_s: 
         return Evidence(f"{costs.seen} shards of {name}, made on this machine", costs, start_s)
     scenes = planned.shards * planned.manifest.layout.scenes_per_shard
     sources = (planned.houses, planned.objects, planned.scenes_from)
-    selection = planned.selection
-    evidence = run_pilot(planned.manifest, sources, selection, scenes, job_options, began_s)
+    evidence = run_pilot(planned.manifest, sources, scenes, job_options, began_s)
     if planned.run is None or not planned.run.committed():
         return evidence
     return Evidence(evidence.text, evidence.costs, evidence.start_s)  # the pilot's scenes are made already

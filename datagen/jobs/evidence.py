@@ -74,7 +74,7 @@ def made_shard(commit: Commit) -> MadeShard:
 def earlier_run(out: str, manifest: Manifest) -> tuple[Run, SeenCosts] | None:
     """The newest run of the same kind that this machine has made in the folder of `out`.
 
-    Runs of the same kind have the same specification except for seed, source of the scenes and selection.
+    Runs of the same kind have the same specification except for seed and source of the scenes.
     """
     if "://" in out:
         return None
@@ -102,6 +102,6 @@ def own_costs(run: Run) -> SeenCosts | None:
 
 
 def _kind(manifest: Manifest) -> dict[str, Any]:
-    fields = manifest.spec.model_dump(mode="json", exclude={"seed", "scenes_from", "selection"})
+    fields = manifest.spec.model_dump(mode="json", exclude={"seed", "scenes_from"})
     size = manifest.layout.candidates_per_scene
     return fields | {"again": manifest.spec.scenes_from is not None, "per_scene": size}

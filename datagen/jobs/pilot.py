@@ -14,7 +14,6 @@ from datagen.jobs.options import JobOptions
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout, Manifest
-from datagen.schemas.selection import Selection
 from datagen.schemas.storage import open_storage
 
 # A pilot's shards are small, so that each worker makes several; the first scenes of a worker cost more.
@@ -39,7 +38,6 @@ def worker_count(job_options: JobOptions) -> int:
 def run_pilot(
     manifest: Manifest,
     sources: Sequence[str],
-    selection: Selection | None,
     scenes: int,
     job_options: JobOptions,
     began_s: float,
@@ -62,7 +60,7 @@ def run_pilot(
     # A shard that is killed at Ctrl-C may still write: the system removes files that are left.
     with TemporaryDirectory(prefix="datagen-pilot-", ignore_cleanup_errors=True) as folder:
         small = manifest.model_copy(update={"layout": layout})
-        run = Run.create_or_open(open_storage(folder), small, shards * layout.samples_per_shard, selection)
+        run = Run.create_or_open(open_storage(folder), small, shards * layout.samples_per_shard)
         plan = JobPlan(run.storage, folder, [JobRun(run, *sources)], job_options, began_s, (), ())
         summary = make_missing(plan, open_recorder(plan))
         made = made_here(run)

@@ -21,7 +21,6 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.record_files import different_fields
 from datagen.schemas.run import Run
-from datagen.schemas.selection import selection_of
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import Storage, open_storage
@@ -100,7 +99,7 @@ def planned_run(job_run: JobRun, n: int, quarantined: bool = False) -> PlannedRu
     decided = run.committed() if quarantined else run.committed() | run.quarantined()
     shards = len(ShardRanges.of(range(run.layout.shards_for(n))).without(ShardRanges.of(decided)))
     sources = job_run.houses, job_run.objects, job_run.scenes_from
-    return PlannedRun(run.manifest, run, n, shards, *sources, selection_of(run))
+    return PlannedRun(run.manifest, run, n, shards, *sources)
 
 
 def start_job(

@@ -16,7 +16,7 @@ from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.run import Run
-from datagen.schemas.selection import rows_to_label
+from datagen.schemas.scene_rows import read_scenes
 from datagen.schemas.shard_files import encode_shard
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import load_label_source
@@ -174,11 +174,8 @@ def regenerate_shard(run: Run, shard: int, origin: OpenedSources) -> ShardResult
     """Compute the shard's rows again; exceptions of the computation are not caught."""
     first = shard * run.layout.scenes_per_shard
     scenes = range(first, first + run.layout.scenes_per_shard)
-    if origin.scenes is None:
-        return run_shard(run.manifest.spec, origin.world, scenes, None, run.schema.version)
-    labelled = list(rows_to_label(run, origin.scenes, scenes))
-    indices, stored = [index for index, _ in labelled], [rows for _, rows in labelled]
-    return run_shard(run.manifest.spec, origin.world, indices, stored, run.schema.version)
+    stored = None if origin.scenes is None else list(read_scenes(origin.scenes, scenes))
+    return run_shard(run.manifest.spec, origin.world, scenes, stored, run.schema.version)
 
 
 def regenerated_files(run: Run, made: ShardResult) -> dict[str, bytes]:

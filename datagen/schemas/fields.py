@@ -223,10 +223,6 @@ SIM_FIELDS = (
           "outcome of the last execution after a first that failed; the label is the first's",
           0, len(RETRY_OUTCOMES) - 1, RETRY_OUTCOMES, since=3),
 )
-# Stored only by runs of selected candidates.
-SELECTION_PROBABILITY = Field(
-    "selection_probability", "float64", (), "1", "",
-    "probability with which the candidate, and its scene, was selected to be labelled", 0, 1)
 # fmt: on
 
 _SIZES = {
@@ -258,6 +254,4 @@ def sized_schema(name: str, spec: Specification, version: int | None = None) -> 
                 "Use the version of the program that made the run, or start a new run",
             )
         schema = schema.at(version)
-    if spec.selection is not None:
-        schema = replace(schema, sample_fields=(*schema.sample_fields, SELECTION_PROBABILITY))
     return schema.sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 # The record of merged runs, which names the parts.
 MERGED = "merged.json"
-# The record of the candidates that were selected from another run.
-SELECTION = "selection.json"
 # Marks the folder of an attempt that is being removed.
 REMOVING = "removing"
 

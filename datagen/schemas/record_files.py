@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.keys import SELECTION
 from datagen.schemas.run_records import FORMAT_VERSION, Manifest
 from datagen.schemas.storage import Storage
 from datagen.schemas.storage.errors import NotARegularFile
@@ -119,7 +118,7 @@ def refuse_other_format(place: str, version: int) -> None:
 def refuse_foreign(storage: Storage, *also: str) -> None:
     """Raise InputError for a folder with other files than a run's; `also` are further allowed prefixes."""
     folders = ("plans/", "copies/", "shards/", "commits/", "ledger/", ".probe-")
-    ours = ("manifest.json", SELECTION, *folders, *also)
+    ours = ("manifest.json", *folders, *also)
     problem, fix = "holds other files than those of a run", "Choose a new --out"
     try:
         for file in storage.list(""):

@@ -20,7 +20,6 @@ from datagen.schemas.fields import RecordSchema, sized_schema
 from datagen.schemas.keys import (
     MERGED,
     REMOVING,
-    SELECTION,
     commit_copy_key,
     commit_key,
     part_folder,
@@ -47,7 +46,6 @@ from datagen.schemas.run_records import (
     Merged,
     Plan,
     QuarantineRecord,
-    StoredRecord,
     foreign_field,
     other_value,
 )
@@ -77,20 +75,14 @@ class Run:
         return f"Run({self.storage.url!r})"
 
     @classmethod
-    def create_or_open(
-        cls, storage: Storage, manifest: Manifest, n: int, selection: StoredRecord | None = None
-    ) -> Run:
+    def create_or_open(cls, storage: Storage, manifest: Manifest, n: int) -> Run:
         """Create a run of n samples, or open the existing one and grow it to n if it is shorter.
-
-        `selection` is the record of the selected candidates, where the specification names one.
 
         An existing run keeps its layout. InputError when it has another specification or format, with every
         field that differs, or when the folder holds other files.
         """
         if not storage.exists("manifest.json"):
             refuse_foreign(storage)
-            if selection is not None:
-                publish(storage, SELECTION, encode_record(selection))
             publish(storage, "manifest.json", encode_record(manifest))
         run = cls.open(storage)
         _ = run.schema  # InputError for an unknown version

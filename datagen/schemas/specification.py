@@ -239,22 +239,6 @@ class ScenesFrom(_Frozen):
     spec_hash: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
-class SelectionParams(_Frozen):
-    """Which candidates of the stored scenes are labelled, and how they were selected.
-
-    `scenes` is the number of scenes that they were selected from, `per_scene` that of candidates selected in
-    each selected scene, `sha256` the digest of the run's selection.json, and `models` those of checkpoints.
-    """
-
-    method: Literal["random", "margin", "uncertain", "disagree"]
-    per_scene: int = Field(ge=1, le=1_000_000)
-    scenes: int = Field(ge=1)
-    random_share: float = Field(gt=0, le=1)
-    seed: int = Field(default=0, ge=0, lt=2**63)
-    models: tuple[str, ...] = ()
-    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
-
-
 class VisibilityParams(_Frozen):
     """Rays of the visibility window (n x n, fitted to the target's bounding sphere)."""
 
@@ -301,7 +285,6 @@ class Specification(_Frozen):
     heuristic: HeuristicParams = HeuristicParams()
     arm: ArmParams | None = None
     scenes_from: ScenesFrom | None = None
-    selection: SelectionParams | None = None
     # Versions of the label code and of the engines that can change bits, by name.
     engines: dict[str, str] = Field(default_factory=dict)
 

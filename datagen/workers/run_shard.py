@@ -19,7 +19,7 @@ import numpy as np
 
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import SELECTION_PROBABILITY, SceneRows, sized_schema
+from datagen.schemas.fields import SceneRows, sized_schema
 from datagen.schemas.identity import sample_ids
 from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.specification import Specification
@@ -74,10 +74,7 @@ def run_shard(
             candidates, record = reconstruct_candidates(rows.samples, scene), rows.record
         labelled = source.label(scene, candidates, spec, clock)
         scene_rows.append(record)
-        columns = candidate_columns(index, candidates, spec_hash, source) | labelled
-        if spec.selection is not None and rows is not None:
-            columns[SELECTION_PROBABILITY.name] = rows.samples[SELECTION_PROBABILITY.name]
-        sample_blocks.append(columns)
+        sample_blocks.append(candidate_columns(index, candidates, spec_hash, source) | labelled)
 
     scene_columns = {
         f.name: _stack(f.dtype, [row[f.name] for row in scene_rows]) for f in schema.scene_fields

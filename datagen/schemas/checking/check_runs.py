@@ -10,7 +10,7 @@ from itertools import chain
 from datagen.schemas.checking.commits import CheckedShard, check_account, check_commit
 from datagen.schemas.checking.finding import Finding, below
 from datagen.schemas.checking.ledger import LedgerTotals, check_quarantine, check_rest
-from datagen.schemas.checking.roots import check_notes, check_plans, check_selection, open_roots
+from datagen.schemas.checking.roots import check_notes, check_plans, open_roots
 from datagen.schemas.checking.sealed import SealedTally, check_chunks, check_store, read_root, runs_named
 from datagen.schemas.checking.shards import ShardForm, check_shard, form_of
 from datagen.schemas.concurrent_map import concurrent_map
@@ -59,7 +59,7 @@ def check_runs(
     wanted: dict[str, int] = {}
     for run in roots.runs:
         wanted[run.manifest.spec_hash], found = check_plans(run)
-        yield from below(roots.folder_of(run), chain(found, check_selection(run), check_notes(run.storage)))
+        yield from below(roots.folder_of(run), chain(found, check_notes(run.storage)))
     if roots.is_merged:
         yield from check_notes(storage)
     root, found = read_root(storage, roots.runs, wanted)

@@ -6,14 +6,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from datagen.schemas.checking.finding import Finding, Restore, below, curable
-from datagen.schemas.checking.records import BACKUP, AnyRecord, compare, read, sound
+from datagen.schemas.checking.records import AnyRecord, compare, read, sound
 from datagen.schemas.errors import InputError
-from datagen.schemas.keys import MERGED, SELECTION, part_folder
+from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.lineage import LINEAGE, Lineage
 from datagen.schemas.record_files import copy_key, encode_record, refuse_other_format
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import FORMAT_VERSION, Commit, Manifest, Merged, Plan, other_value
-from datagen.schemas.selection import Selection, misfit
 from datagen.schemas.storage import Storage
 
 _MANIFEST = "manifest.json"
@@ -140,19 +139,6 @@ def check_plans(run: Run) -> tuple[int, list[Finding]]:
     if not n:
         findings.append(Finding("plans", "record", "has no plan with the number of samples wanted", fix))
     return n, findings
-
-
-def check_selection(run: Run) -> list[Finding]:
-    """Return findings on the record of selected candidates, where the specification names one."""
-    if run.manifest.spec.selection is None:
-        return []
-    ours, copy = (
-        read(run.storage, key, Selection, lambda selection: misfit(run, selection))
-        for key in (SELECTION, copy_key(SELECTION))
-    )
-    if ours.data is None and copy.data is None:
-        return [Finding(SELECTION, "record", "missing, as is its copy", BACKUP)]
-    return compare(ours, copy)
 
 
 def check_notes(storage: Storage) -> Iterator[Finding]:

@@ -13,23 +13,19 @@ import numpy as np
 
 from datagen.schemas.checking.finding import Finding, Regenerate, curable
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import SELECTION_PROBABILITY, Field, RecordSchema, Table
+from datagen.schemas.fields import Field, RecordSchema, Table
 from datagen.schemas.identity import sample_ids
 from datagen.schemas.keys import commit_key, shard_folder
 from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, FileEntry
-from datagen.schemas.selection import keys_of, selection_of
 from datagen.schemas.shard_files import MAX_TEXT_BYTES, chunk_paths, group_metadata, rows_per_shard
 from datagen.schemas.shard_reading import MAX_META_BYTES, Array, StoredArray, decode_chunk, parse_metadata
 from datagen.schemas.storage import StoredFile
 
 _WRONG_FIX = "It is undamaged but wrong: remove the commit and its copy, and `datagen resume` makes it again"
 # Arrays that are checked together; every other array is checked by itself.
-_KEYS = (
-    *("scene_index", "redraws", "sample_id", "sample_scene_index", "candidate_index", "label"),
-    SELECTION_PROBABILITY.name,
-)
+_KEYS = ("scene_index", "redraws", "sample_id", "sample_scene_index", "candidate_index", "label")
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,23 +165,16 @@ def _decode(
 def _row_problems(run: Run, commit: Commit, kept: Mapping[str, Array]) -> Iterator[tuple[str, str]]:
     """Yield (array, problem) where rows are not those of this shard, or differ from its commit."""
     first = commit.shard * run.layout.scenes_per_shard
-    try:
-        keys = [keys_of(run, scene) for scene in range(first, first + commit.scenes)]
-    except InputError as error:
-        yield "scene_index", f"cannot be checked: selection.json {error.problem}"
-        return
-    indices = np.array([index for index, _ in keys])
-    ids = [sample_ids(run.manifest.spec_hash, index, candidates) for index, candidates in keys]
+    scenes = np.arange(first, first + commit.scenes)
+    candidates = np.arange(run.layout.candidates_per_scene, dtype=np.int32)
     wanted: dict[str, np.ndarray[Any, Any]] = {
-        "scene_index": indices,
-        "sample_scene_index": np.repeat(indices, run.layout.candidates_per_scene),
-        "candidate_index": np.concatenate([candidates for _, candidates in keys]),
-        "sample_id": np.concatenate(ids),
+        "scene_index": scenes,
+        "sample_scene_index": np.repeat(scenes, len(candidates)),
+        "candidate_index": np.tile(candidates, len(scenes)),
+        "sample_id": np.concatenate(
+            [sample_ids(run.manifest.spec_hash, int(scene), candidates) for scene in scenes]
+        ),
     }
-    selection = selection_of(run)
-    if selection is not None:
-        rows = selection.probability[first : first + commit.scenes]
-        wanted[SELECTION_PROBABILITY.name] = np.array(rows).ravel()
     for name, values in wanted.items():
         if not np.array_equal(kept[name], values):
             row = int(np.flatnonzero((kept[name] != values).reshape(len(values), -1).any(axis=1))[0])

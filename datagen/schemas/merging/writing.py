@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.keys import SELECTION, shard_folder
+from datagen.schemas.keys import shard_folder
 from datagen.schemas.ledger import end_key, start_key
 from datagen.schemas.lineage import LINEAGE, Origins, ShardOrigin, encode_lineage
 from datagen.schemas.merging.ledgers import UnitedLedger
@@ -20,7 +20,6 @@ from datagen.schemas.record_files import MAX_RECORD_BYTES, copy_key, encode_reco
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, QuarantineRecord
 from datagen.schemas.scene_rows import read_shard
-from datagen.schemas.selection import selection_of
 from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.storage import Storage
 
@@ -45,9 +44,6 @@ def begin_union(union: Union, storage: Storage) -> Run:
     InputError where there is another run.
     """
     if not storage.exists("manifest.json"):
-        selection = selection_of(union.runs[0])
-        if selection is not None:
-            publish(storage, SELECTION, encode_record(selection))
         publish(storage, "manifest.json", encode_record(union.manifest))
     run = Run.open(storage)
     for field, found, expected in (

@@ -17,8 +17,7 @@ from datagen.display.progress import Progress, Seen
 from datagen.schemas.errors import InputError
 from datagen.train.augment import Augmentation
 from datagen.train.dataset import SampleStream
-from datagen.train.encoded.batches import EncodedBatches
-from datagen.train.encoded.runs import encode_runs, encoded_stream
+from datagen.train.encoded_runs import EncodedBatches, encode_runs, encoded_stream
 from datagen.train.label_versions import refuse_mixed_labels
 from datagen.train.models import Model, build_model
 from datagen.train.models.shared import SharedModel

@@ -1,4 +1,4 @@
-"""Encoded runs give models what plain batches give them, in nested subsets of houses."""
+"""Encoded runs give models what plain batches give them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ import pytest
 import torch
 
 from datagen.schemas.errors import InputError
-from datagen.train.encoded.batches import EncodedBatches, hold_out, house_order, subset_of_houses
-from datagen.train.encoded.runs import EncodedRuns, encode_runs, encoded_stream, open_encoded
-from datagen.train.encoded.training import scores_of, train_encoded
+from datagen.train.encoded_runs import (
+    EncodedBatches,
+    EncodedRuns,
+    encode_runs,
+    encoded_stream,
+    open_encoded,
+)
 from datagen.train.models.shared import SharedModel
 from datagen.train.scorers import ModelScorer
-from datagen.train.training.options import Options
 from tests.train.models.made_batches import SMALL
 from tests.train.stream_runs import make_stream_run
 
@@ -45,18 +48,11 @@ def test_a_model_scores_encoded_candidates_as_it_scores_clouds(heuristic_run: Pa
     data = encode_runs(stream, model, tmp_path, no_progress)
     batches = list(stream.epoch(0))
     plain = np.concatenate([ModelScorer(model, "model").score(batch) for batch in batches])
-    np.testing.assert_allclose(scores_of(model, data), plain, atol=2e-3)  # tokens have half precision
+    again = EncodedBatches(data, np.arange(len(data.houses)), 4).epoch(0)
+    scores = np.concatenate([ModelScorer(model, "model").score(batch) for batch in again])
+    np.testing.assert_allclose(scores, plain, atol=2e-3)  # tokens have half precision
     assert np.ptp(plain) > 0.01
-    some = np.array([1, 4, 2])
-    chosen = np.concatenate([np.flatnonzero(data.scene_of_candidate == scene) for scene in some])
-    np.testing.assert_allclose(scores_of(model, data, some), scores_of(model, data)[chosen], atol=1e-5)
     np.testing.assert_array_equal(data.label, np.concatenate([batch.label for batch in batches]))
-    within = [
-        (batch.extra["base_is_clear"] == 1)
-        & (batch.extra["mount_distance_m"] <= batch.robots.arm_reach_m[batch.candidates.robot_row])
-        for batch in batches
-    ]
-    np.testing.assert_array_equal(data.in_range, np.concatenate(within))
 
 
 def test_trainings_that_encode_the_same_runs_side_by_side_share_them(tmp_path: Path):
@@ -101,22 +97,6 @@ def test_an_epoch_has_every_scene_once_and_another_order_each_time(data: Encoded
     assert len(ids(0)) == batches.n_samples == sum(batches.class_counts()) == 11 * 6
 
 
-def test_larger_shares_hold_the_houses_of_smaller_ones_and_seeds_differ(data: EncodedRuns):
-    subsets = [set(subset_of_houses(data, share, 1).tolist()) for share in (0.2, 0.5, 1.0)]
-    assert subsets[0] < subsets[1] < subsets[2] == set(range(21))
-    houses = {str(data.houses[scene]) for scene in subsets[1]}
-    assert {k for k in range(21) if str(data.houses[k]) in houses} == subsets[1]
-    assert len({tuple(house_order(data.houses, seed)) for seed in range(5)}) > 1
-
-
-def test_held_out_houses_are_in_no_training(data: EncodedRuns):
-    train, held = hold_out(data, subset_of_houses(data, 0.5, 1), 1)
-    assert set(data.houses[train]).isdisjoint(data.houses[held]) and len(held) and len(train)
-    many = EncodedRuns("key", data.tokens, {**data.columns, "house": np.array([f"h{k}" for k in range(21)])})
-    train, held = hold_out(many, np.arange(21), 1)
-    assert len(held) == 2 and len(train) == 19
-
-
 def test_encodings_are_made_once_and_again_for_other_tokens_or_samples(tmp_path: Path):
     make_stream_run(tmp_path / "run", 36)
     make_stream_run(tmp_path / "other", 36, seed=1)
@@ -138,21 +118,3 @@ def test_a_damaged_encoding_is_named(file: str, tmp_path: Path):
     (place / file).write_bytes((place / file).read_bytes()[:100])
     with pytest.raises(InputError, match=rf"{key}.*is damaged.*Remove this folder"):
         open_encoded(place)
-
-
-def test_equal_trainings_give_equal_weights_and_begin_from_what_they_are_given(data: EncodedRuns):
-    options = Options("sim-only", "shared", SMALL_SHARED, epochs=2, batch_scenes=4)
-    scenes, judged = hold_out(data, np.arange(21), 0)
-
-    def trained(**changes: object):
-        batches = EncodedBatches(data, scenes, 4, seed=0), EncodedBatches(data, judged, 4)
-        found = train_encoded(options, *batches, changes.get("init"), lambda: False)  # type: ignore[arg-type]
-        assert found is not None and 1 <= found.best_epoch <= 2
-        return found.model
-
-    first, again = trained(), trained()
-    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), again.parameters(), strict=True))
-    other = trained(init=first.state_dict())
-    assert not all(torch.equal(a, b) for a, b in zip(first.parameters(), other.parameters(), strict=True))
-    both = EncodedBatches(data, scenes, 4, seed=0), EncodedBatches(data, judged, 4)
-    assert train_encoded(options, *both, None, lambda: True) is None

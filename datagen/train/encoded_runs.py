@@ -11,7 +11,7 @@ import os
 import shutil
 import uuid
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,16 +23,14 @@ import torch
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
 from datagen.train.dataset import SampleStream
-from datagen.train.inputs import F32, I64, U8, Array, Batch, Bools, RobotInputs
+from datagen.train.inputs import I64, Array, Batch, Bools, RobotInputs
 from datagen.train.models.encoded_clouds import EncodedCandidates, EncodedClouds, pack, packed_width
 from datagen.train.models.shared import SharedModel
 from datagen.train.models.tokens import token_sizes
 from datagen.train.tensors import to_torch
-from datagen.workers.bases.candidate_sets import in_set
 
 # Raise it when the same run would give other tokens or columns.
-_VERSION = 2
-EXTRA = ("house_id", "base_is_clear", "mount_distance_m")
+_VERSION = 3
 # Fields of a model's configuration that decide its tokens.
 _DECISIVE = ("n_points", "tokens", "near_m", "scales_m", "camera", "observed_visibility", "hand_poses")
 _TOKENS, _COLUMNS = "tokens.f16", "columns.npz"
@@ -72,11 +70,6 @@ class EncodedRuns:
         """Labels (N,), 0 or 1."""
         return self.columns["label"]
 
-    @property
-    def in_range(self) -> Bools:
-        """Mask (N,) of candidates with a clear base and the target within reach."""
-        return self.columns["in_range"]
-
     def batch(self, scenes: I64) -> Batch[Array]:
         """A batch of these scenes, in their order."""
         robots, cloud_row = _ranges(self.robot_bounds, scenes)
@@ -103,6 +96,38 @@ class EncodedRuns:
         )
 
 
+class EncodedBatches:
+    """Epochs of batches of some scenes, as `run_training` reads them."""
+
+    def __init__(
+        self, encoded: EncodedRuns, scenes: I64, scenes_per_batch: int, seed: int | None = None
+    ) -> None:
+        """With `seed` the scenes are shuffled in each epoch; without, they keep their order."""
+        self._encoded, self._scenes, self._seed = encoded, scenes, seed
+        self.batches_per_epoch = max(1, -(-len(scenes) // scenes_per_batch))
+
+    def epoch(self, k: int, skip_batches: int = 0) -> Iterator[Batch[Array]]:
+        """Batches of epoch k from batch `skip_batches` on."""
+        order = self._scenes
+        if self._seed is not None:
+            order = np.random.default_rng([self._seed, k]).permutation(order)
+        for some in np.array_split(order, self.batches_per_epoch)[skip_batches:]:
+            yield self._encoded.batch(some)
+
+    @property
+    def n_samples(self) -> int:
+        """Candidates of one epoch."""
+        return int(self._chosen().sum())
+
+    def class_counts(self) -> tuple[int, int]:
+        """(negatives, positives) of one epoch."""
+        positives = int(self._encoded.label[self._chosen()].sum())
+        return self.n_samples - positives, positives
+
+    def _chosen(self) -> Bools:
+        return np.isin(self._encoded.scene_of_candidate, self._scenes)
+
+
 def _ranges(bounds: I64, rows: I64) -> tuple[I64, I64]:
     """Numbers bounds[r] .. bounds[r + 1] of all rows r, and for each number its row's index in `rows`."""
     counts = bounds[rows + 1] - bounds[rows]
@@ -116,7 +141,7 @@ def encode_runs(
 ) -> EncodedRuns:
     """The scenes of a stream, read from `folder` or encoded into it.
 
-    The stream is unshuffled, has all candidates, and reads `EXTRA`. `seen(done, of)` is called while scenes
+    The stream is unshuffled and has all candidates. `seen(done, of)` is called while scenes
     are encoded.
     """
     decisive = {name: model.config[name] for name in _DECISIVE}
@@ -181,8 +206,6 @@ def _write(stream: SampleStream, model: SharedModel, place: Path, seen: Callable
 
 def _columns(batch: Batch[Array], scenes: int, robots: int) -> dict[str, Array]:
     owner = batch.candidates.robot_row
-    reach_m: F32 = batch.robots.arm_reach_m[owner]
-    clear: U8 = batch.extra["base_is_clear"]
     return {
         "house": batch.extra["house_id"].astype(str),
         "target_height_m": batch.clouds.target_height_m,
@@ -195,12 +218,11 @@ def _columns(batch: Batch[Array], scenes: int, robots: int) -> dict[str, Array]:
         "base_xy_m": batch.candidates.base_xy_m,
         "label": batch.label.astype(np.uint8),
         "sample_id": batch.sample_id,
-        "in_range": in_set("in-range", clear.astype(np.bool_), batch.extra["mount_distance_m"], reach_m),
     }
 
 
 def encoded_stream(paths: Sequence[str], allow_incomplete: bool) -> SampleStream:
     """The stream of these runs that `encode_runs` reads."""
     return SampleStream(
-        paths, scenes_per_batch=16, shuffle=False, extra=EXTRA, allow_incomplete=allow_incomplete
+        paths, scenes_per_batch=16, shuffle=False, extra=("house_id",), allow_incomplete=allow_incomplete
     )

@@ -1,1 +1,0 @@
-"""Estimates of success rates from cheap and dear labels, and the choice of candidates to label."""

@@ -1,1 +1,0 @@
-"""Accuracy of models against the cost of their labels, and the label source to buy next."""
