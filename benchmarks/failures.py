@@ -25,8 +25,8 @@ from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.specification import Specification
 from datagen.workers.labels.arm_labelling import ArmInScene, CandidateTrial, arm_in_scene, try_candidate
+from datagen.workers.scenes import SettledScene
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
-from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.world import open_world
 
 _VIEW_PX, _TEXT_PX, _COLOURS = (120, 90), 12, 48

@@ -26,10 +26,10 @@ from datagen.train.prediction.target import locate
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
-from datagen.workers.rendering.embree_renderer import render_rays
+from datagen.workers.rendering.embree import render_rays
 from datagen.workers.rendering.noise import add_noise
+from datagen.workers.scenes import Scene
 from datagen.workers.scenes.generate import generate_scene
-from datagen.workers.scenes.scene import Scene
 from datagen.workers.world import assemble_world
 
 

@@ -29,7 +29,7 @@ from datagen.workers.grasps.targets import JUDGED_GRASPS, Graspability, Targets,
 from datagen.workers.objects import open_objects
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots import gripper_of
-from datagen.workers.robots.gripper import Gripper
+from datagen.workers.robots.description import Gripper
 
 _STABILITY_GRASPS = 8  # of each object
 _VARIANTS = {

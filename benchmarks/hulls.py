@@ -22,7 +22,7 @@ from datagen.workers.geometry.mesh import F32
 from datagen.workers.geometry.transforms import translation
 from datagen.workers.objects import open_objects
 from datagen.workers.objects.part_merging import merge_parts
-from datagen.workers.settling.sapien_bodies import add_object, add_static
+from datagen.workers.settling.sapien_physics import add_object, add_static
 from tests.workers.objects.merging_errors import added_volume_share, cut_off_m, error_m
 
 

@@ -32,12 +32,12 @@ from datagen.workers.labels.arm_labelling import (
     draw_disturbances,
     try_candidate,
 )
-from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.motion import MotionPlan
 from datagen.workers.motion.planning_scene import pose_of_base
 from datagen.workers.objects import open_objects
 from datagen.workers.scenes.generate import generate_scene
+from datagen.workers.trials import Disturbance
 from datagen.workers.trials.execute import run_trial
-from datagen.workers.trials.trial import Disturbance
 from datagen.workers.trials.trial_scene import prepare_trials
 from datagen.workers.world import assemble_world
 

@@ -32,13 +32,13 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, quaternion_wxyz
 from datagen.workers.grasps.grasp_cache import grasps_of
 from datagen.workers.houses import open_houses
-from datagen.workers.motion.motion_plan import PlanReport
+from datagen.workers.motion import PlanReport
 from datagen.workers.motion.plan_candidate import plan_candidate
 from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
 from datagen.workers.objects import open_objects
 from datagen.workers.robots import open_robot, robot_limits
+from datagen.workers.scenes import Scene
 from datagen.workers.scenes.generate import generate_scene
-from datagen.workers.scenes.scene import Scene
 from datagen.workers.world import World, assemble_world
 
 _POINTS = 8000  # of a scene, for the peer

@@ -34,8 +34,8 @@ from datagen.schemas.specification import Specification
 from datagen.train.evaluation.bootstrap import resample_weights
 from datagen.workers.bases.candidates import SceneCandidates, distances
 from datagen.workers.labels.arm_labelling import ArmInScene, arm_in_scene, try_candidate
+from datagen.workers.scenes import SettledScene
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
-from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.world import open_world
 
 _RESAMPLES = 2000

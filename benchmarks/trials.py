@@ -27,9 +27,8 @@ from benchmarks.physical_sense import Case, plan_options, planned_cases
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import DisturbanceParams, Specification, TrialParams
 from datagen.workers.labels.arm_labelling import arm_of, draw_disturbances
-from datagen.workers.trials import execute, physics
+from datagen.workers.trials import Disturbance, TrialResult, execute, physics
 from datagen.workers.trials.execute import run_trial
-from datagen.workers.trials.trial import Disturbance, TrialResult
 from datagen.workers.trials.trial_scene import (
     MovableObjects,
     TrialScene,

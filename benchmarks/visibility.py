@@ -22,9 +22,8 @@ from datagen.schemas.cost import StageClock
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
-from datagen.workers.rendering.embree_renderer import ray_scene
-from datagen.workers.rendering.frame import SceneGeometry
-from datagen.workers.rendering.rays import RayScene, first_hits, into_frame
+from datagen.workers.rendering import SceneGeometry
+from datagen.workers.rendering.embree import RayScene, first_hits, into_frame, ray_scene
 from datagen.workers.rendering.visibility import visible_pixels
 from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.world import assemble_world

@@ -23,10 +23,10 @@ from datagen.schemas.scene_rows import read_scenes
 from datagen.schemas.specification import Source, Specification
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
-from datagen.workers.rendering.embree_renderer import render_rays
+from datagen.workers.rendering.embree import render_rays
+from datagen.workers.scenes import Scene
 from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_scene
-from datagen.workers.scenes.scene import Scene
 from datagen.workers.world import assemble_world, open_world
 from tests.train.prediction.seen_scenes import Seen, write_frame
 

@@ -28,7 +28,7 @@ from datagen.schemas.whole_files import whole_file
 from datagen.workers.labels.arm_labelling import arm_in_scene, draw_disturbances
 from datagen.workers.labels.arrival_trial import arrival_specification, try_arrival
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
-from datagen.workers.trials.trial import Disturbance
+from datagen.workers.trials import Disturbance
 from datagen.workers.world import World, open_world
 
 # Raise it when the same arrival would have another outcome for a reason that `engines` does not name.

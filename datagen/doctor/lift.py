@@ -14,13 +14,12 @@ import numpy as np
 from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import translation
-from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.motion import MotionPlan
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.robot import Robot
-from datagen.workers.trials.articulation import articulation_of
+from datagen.workers.trials import Disturbance
 from datagen.workers.trials.execute import run_trial
-from datagen.workers.trials.trial import Disturbance
-from datagen.workers.trials.trial_scene import TrialScene
+from datagen.workers.trials.trial_scene import TrialScene, articulation_of
 
 _BASE_HEIGHT_M, _TABLE_M = 0.5, 0.5
 _CUBE_M, _MASS_KG = 0.05, 0.2

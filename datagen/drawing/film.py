@@ -14,11 +14,10 @@ from datagen.display.styles import TARGET
 from datagen.drawing.film_camera import Shot, Subject, choose_shot, nothing, scaled_camera
 from datagen.drawing.posed_robot import RobotBodies
 from datagen.workers.geometry.mesh import F64, U8
-from datagen.workers.rendering.embree_renderer import cast_pixels
-from datagen.workers.rendering.frame import Camera
-from datagen.workers.rendering.rays import RayMesh, RayScene
+from datagen.workers.rendering import Camera
+from datagen.workers.rendering.embree import RayMesh, RayScene, cast_pixels
 from datagen.workers.scenes.reconstruct import ReconstructedScene
-from datagen.workers.trials.trial import Recording
+from datagen.workers.trials import Recording
 
 Rows = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]

@@ -12,9 +12,8 @@ import numpy.typing as npt
 from datagen.workers.geometry.mesh import F64, Mesh, concatenate
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.houses.house import House, StaticBody
-from datagen.workers.rendering.embree_renderer import cast_pixels
-from datagen.workers.rendering.frame import Camera
-from datagen.workers.rendering.rays import RayMesh, RayScene, occluded, ray_mesh
+from datagen.workers.rendering import Camera
+from datagen.workers.rendering.embree import RayMesh, RayScene, cast_pixels, occluded, ray_mesh
 
 _AZIMUTHS, _ELEVATIONS_DEG = 20, (20.0, 42.0)
 _PROBE_PX = 56  # width of the images that compare views

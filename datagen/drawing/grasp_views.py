@@ -15,10 +15,9 @@ from matplotlib.colors import Normalize
 from datagen.workers.furniture.solids import box, join
 from datagen.workers.geometry.mesh import F32, F64, U8, Mesh
 from datagen.workers.geometry.transforms import look_at
-from datagen.workers.rendering.embree_renderer import render_rays
-from datagen.workers.rendering.frame import Camera, Frame
-from datagen.workers.rendering.rays import RayScene, ray_mesh
-from datagen.workers.robots.gripper import Gripper
+from datagen.workers.rendering import Camera, Frame
+from datagen.workers.rendering.embree import RayScene, ray_mesh, render_rays
+from datagen.workers.robots.description import Gripper
 from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 _SAME_M, _SAME_RAD = 0.004, 0.06  # joint angles reach a grasp within 0.5 mm and 0.5 degrees

@@ -9,7 +9,7 @@ import numpy as np
 from datagen.workers.furniture.solids import frustum, join
 from datagen.workers.geometry.mesh import F64, I32, Mesh
 from datagen.workers.geometry.transforms import inverse, translation
-from datagen.workers.rendering.rays import RayMesh, ray_mesh
+from datagen.workers.rendering.embree import RayMesh, ray_mesh
 from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.urdf import read_urdf
 

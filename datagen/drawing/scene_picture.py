@@ -26,7 +26,7 @@ from datagen.schemas.fields import SceneRows
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.specification import Specification
-from datagen.workers.rendering.frame import Frame
+from datagen.workers.rendering import Frame
 from datagen.workers.scenes.generate import render_frame
 from datagen.workers.scenes.reconstruct import ReconstructedScene
 

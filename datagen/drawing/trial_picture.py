@@ -35,13 +35,13 @@ from datagen.workers.labels.arm_labelling import (
     arm_of,
     try_candidate,
 )
+from datagen.workers.motion import MotionPlan
 from datagen.workers.motion.arm_collision import surroundings
-from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.motion.rrt_connect import dense
 from datagen.workers.robots.robot import Robot
+from datagen.workers.scenes import SettledScene
 from datagen.workers.scenes.reconstruct import reconstruct_candidates
-from datagen.workers.scenes.scene import SettledScene
-from datagen.workers.trials.trial import Recording, TrialResult
+from datagen.workers.trials import Recording, TrialResult
 
 _STEP_S = 0.05  # between the moments of a plan that was not executed
 _STEP_RAD = 0.08  # advance of a plan in that time, over all joints

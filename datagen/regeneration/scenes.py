@@ -21,9 +21,9 @@ from datagen.schemas.shard_files import encode_shard
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import load_label_source
 from datagen.workers.run_shard import Columns, ShardResult, candidate_columns, run_shard, scene_row
+from datagen.workers.scenes import SettledScene
 from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
-from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.world import World, assemble_world, open_world
 
 _NO_SCENES = "the run that made the scenes does not exist any more"

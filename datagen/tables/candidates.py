@@ -16,7 +16,7 @@ from datagen.schemas.shard_reading import ShardPlace
 from datagen.tables.stored_fields import fields_of, refuse_unknown
 from datagen.train.reader import JOIN_FIELDS, Columns, load_shard, native
 from datagen.train.run_parts import RunPart, open_parts, refuse_twins
-from datagen.workers.houses.split import split_of
+from datagen.workers.houses import split_of
 
 Array = npt.NDArray[Any]
 

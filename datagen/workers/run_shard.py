@@ -24,12 +24,11 @@ from datagen.schemas.identity import sample_ids
 from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import SceneCandidates
-from datagen.workers.labels import load_label_source
-from datagen.workers.labels.source import LabelSource
-from datagen.workers.rendering.frame import Camera
+from datagen.workers.labels import LabelSource, load_label_source
+from datagen.workers.rendering import Camera
+from datagen.workers.scenes import Scene
 from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_candidates, reconstruct_scene
-from datagen.workers.scenes.scene import Scene
 from datagen.workers.world import World
 
 Columns = dict[str, np.ndarray[Any, Any]]

@@ -19,7 +19,7 @@ from datagen.workers.houses.house import House, HouseSource
 from datagen.workers.objects import open_objects
 from datagen.workers.objects.convex import GRIPPER_VERSION
 from datagen.workers.objects.model import ObjectModel, ObjectSource
-from datagen.workers.rendering.rays import RayMesh, RayScene, house_rays, object_rays
+from datagen.workers.rendering.embree import RayMesh, RayScene, house_rays, object_rays
 
 if TYPE_CHECKING:
     from datagen.workers.grasps.targets import Targets

@@ -11,7 +11,7 @@ from datagen.schemas.errors import InputError
 from datagen.train.augment import Augmentation, Rotation
 from datagen.train.dataset import SampleStream
 from datagen.train.splits import HouseShare, HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
-from datagen.workers.houses.split import split_of
+from datagen.workers.houses import split_of
 from tests.train.stream_runs import make_stream_run
 
 

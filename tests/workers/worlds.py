@@ -10,7 +10,7 @@ from datagen.workers.geometry.mesh import F32, F64, I32, U8, Mesh
 from datagen.workers.geometry.transforms import look_at, translation
 from datagen.workers.houses.house import BodyKind, House, Room, StaticBody, Surface
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.rendering.frame import Camera, SceneGeometry
+from datagen.workers.rendering import Camera, SceneGeometry
 
 Vec3 = tuple[float, float, float]
 Colour = tuple[int, int, int]

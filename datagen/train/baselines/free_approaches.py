@@ -6,7 +6,7 @@ import numpy as np
 
 from datagen.train.baselines.reachability_map import PREGRASP_M
 from datagen.train.inputs import F32, F64, Bools
-from datagen.workers.robots.gripper import Gripper
+from datagen.workers.robots.description import Gripper
 
 _ROLLS = 4  # in half a turn about the approach: the hand is the same after half a turn
 # Stored clouds have a point every 2 to 3 cm: without a margin a finger fits between them.

@@ -6,12 +6,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
-from datagen.workers.furniture import fixture_shapes as x
 from datagen.workers.furniture import furniture_shapes as f
 from datagen.workers.furniture import small_shapes as s
-from datagen.workers.furniture.asset_table import Asset
-from datagen.workers.furniture.colours import pick
-from datagen.workers.furniture.solids import ColouredSolid, Rgb, join
+from datagen.workers.furniture.assets import Asset
+from datagen.workers.furniture.solids import ColouredSolid, Rgb, join, pick
 from datagen.workers.geometry.mesh import F32, Mesh
 
 Shape = Callable[[Asset, Rgb], list[ColouredSolid]]
@@ -49,7 +47,7 @@ SHAPES: dict[str, tuple[Shape, tuple[Rgb, ...]]] = {
     "Candle": (s.column, ((240, 228, 200), (200, 80, 70))),
     "Cart": (f.cart, _METAL),
     "Chair": (f.chair, _WOOD),
-    "ClothesDryer": (x.washing_machine, _ENAMEL),
+    "ClothesDryer": (f.washing_machine, _ENAMEL),
     "CoffeeMachine": (s.coffee_machine, _METAL),
     "CoffeeTable": (f.side_table, _WOOD),
     "CounterTop": (f.counter, _WOOD),
@@ -63,7 +61,7 @@ SHAPES: dict[str, tuple[Shape, tuple[Rgb, ...]]] = {
     "Egg": (s.pebble, ((232, 214, 186),)),
     "FloorLamp": (s.lamp, _METAL),
     "Footstool": (f.stool, _WOOD),
-    "Fridge": (x.fridge, _METAL[:2] + _ENAMEL),
+    "Fridge": (f.fridge, _METAL[:2] + _ENAMEL),
     "GarbageBag": (s.pebble, ((40, 42, 46),)),
     "GarbageCan": (s.bin_, _METAL),
     "HousePlant": (s.plant, _CLAY),
@@ -87,25 +85,25 @@ SHAPES: dict[str, tuple[Shape, tuple[Rgb, ...]]] = {
     "Shelf": (f.shelf, _WOOD),
     "ShelvingUnit": (f.shelf, _WOOD),
     "SideTable": (f.side_table, _WOOD),
-    "Sink": (x.sink, _ENAMEL),
+    "Sink": (f.sink, _ENAMEL),
     "SoapBottle": (s.dispenser, _PLASTIC),
     "Sofa": (f.sofa, _CLOTH),
     "SprayBottle": (s.dispenser, _PLASTIC),
     "Statue": (s.statue, _CLAY),
     "Stool": (f.stool, _WOOD),
-    "Stove": (x.stove, _METAL[:2] + _ENAMEL),
+    "Stove": (f.stove, _METAL[:2] + _ENAMEL),
     "TVStand": (f.tv_stand, _WOOD),
     "Table": (f.table, _WOOD),
     "TeddyBear": (s.teddy, ((150, 106, 66),)),
     "Television": (s.screen, ((38, 38, 42),)),
     "TissueBox": (s.block, _PLASTIC),
     "Toaster": (s.toaster, _METAL),
-    "Toilet": (x.toilet, _ENAMEL),
+    "Toilet": (f.toilet, _ENAMEL),
     "ToiletPaper": (s.column, _ENAMEL),
     "Tomato": (s.pebble, ((200, 52, 38),)),
     "Vase": (s.vase, _CLAY),
-    "WallCabinet": (x.wall_cabinet, _WOOD),
-    "WashingMachine": (x.washing_machine, _ENAMEL),
+    "WallCabinet": (f.wall_cabinet, _WOOD),
+    "WashingMachine": (f.washing_machine, _ENAMEL),
     "WineBottle": (s.bottle, _GLASS),
 }
 

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
-from datagen.workers.furniture.asset_table import Asset
-from datagen.workers.furniture.colours import hash_bytes, pick, shade
-from datagen.workers.furniture.solids import ColouredSolid, Rgb, ball, box, frustum, mirrored, profile
+from datagen.workers.furniture.assets import Asset
+from datagen.workers.furniture.solids import (
+    ColouredSolid,
+    Rgb,
+    ball,
+    box,
+    frustum,
+    hash_bytes,
+    mirrored,
+    pick,
+    profile,
+    shade,
+)
 
 _DARK: Rgb = (38, 38, 42)
 _STEEL: Rgb = (176, 178, 182)

@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import inverse, rotation_of, translation
-from datagen.workers.robots.gripper import Gripper, Parts
-from datagen.workers.settling.sapien_bodies import add_object, convex_shape, pad_material, sapien_pose
+from datagen.workers.robots.description import Gripper, Parts
+from datagen.workers.settling.sapien_physics import add_object, convex_shape, pad_material, sapien_pose
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.

@@ -1,20 +1,31 @@
-"""Search grasps of one object by one gripper: collision-free poses, in a varied order, and their scores."""
+"""Search grasps of an object by a gripper: poses around contacts, in a varied order, and their scores."""
+
+# coal defines its names at import time, which type checkers do not see.
+# pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import coal
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import QhullError
 
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.grasps.contacts import cone_directions, contact_pairs, solid_of, surface_points
+from datagen.workers.grasps.contacts import (
+    Contacts,
+    cone_directions,
+    contact_pairs,
+    perpendicular,
+    solid_of,
+    surface_points,
+)
 from datagen.workers.grasps.floating_hand import HandTest, held_trials
-from datagen.workers.grasps.hand_clearance import HandClearance, lowest_m
-from datagen.workers.grasps.hand_poses import hand_poses, varied
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.robots.gripper import Gripper
+from datagen.workers.robots.description import Gripper
+from datagen.workers.robots.hulls import polyhedron
 
 Bools = npt.NDArray[np.bool_]
 
@@ -137,3 +148,132 @@ def _spread(T_object_tcp: F64, is_clear: Bools) -> npt.NDArray[np.int64]:
 
 def _none(n_tried: int, reason: str) -> HandPoses:
     return HandPoses(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0, bool), n_tried, reason)
+
+
+# How far the contacts lie ahead of the pads' middle, in half pad lengths. Pulled back, the finger tips do not
+# reach below flat objects. Beyond 1 the pads would miss the contacts.
+RETREATS = (-0.5, 0.0, 0.5, 0.8, 0.95)
+# From straight down, about the axis along which the fingers close.
+TILTS_RAD = (0.0, np.radians(15), np.radians(-15), np.radians(30), np.radians(-30))
+# Grasps from above need a closing axis no steeper than this.
+_LEVEL_Z = np.sin(np.radians(35))
+_FREE_TURNS = 4  # approaches all around the closing axis, besides those from above
+# A radian between two directions weighs as much as this distance.
+_METRES_PER_RAD = 0.03
+
+
+def hand_poses(contacts: Contacts, pad_length_m: float, rng: np.random.Generator) -> tuple[F64, F64]:
+    """Poses T_object_tcp (K, 4, 4) of every pair, approach and depth in random order; widths (K,), metres.
+
+    Approaches are drawn all around the closing axis and, where it is level enough for the upright object,
+    from above with `TILTS_RAD`. The contacts lie on pads of `pad_length_m` along the approach, at the same
+    distance left and right of the hand's middle, at one of `RETREATS`.
+    """
+    n = len(contacts)
+    y = contacts.closing * np.where(rng.random(n) < 0.5, 1.0, -1.0)[:, None]
+    u, v = perpendicular(y)
+    turns = 2 * np.pi * rng.random((n, _FREE_TURNS))
+    around = np.cos(turns)[..., None] * u[:, None] + np.sin(turns)[..., None] * v[:, None]
+    level = np.abs(y[:, 2]) < _LEVEL_Z
+    down = -np.array([0.0, 0.0, 1.0]) + y[level, 2:] * y[level]
+    down /= np.linalg.norm(down, axis=1, keepdims=True)
+    across = np.cross(y[level], down)
+    tilts = np.array(TILTS_RAD)
+    above = np.cos(tilts)[:, None] * down[:, None] + np.sin(tilts)[:, None] * across[:, None]
+    row = np.concatenate(
+        [np.repeat(np.arange(n), _FREE_TURNS), np.repeat(np.flatnonzero(level), len(TILTS_RAD))]
+    )
+    approach = np.concatenate([around.reshape(-1, 3), above.reshape(-1, 3)])
+    row = np.repeat(row, len(RETREATS))
+    approach = np.repeat(approach, len(RETREATS), axis=0)
+    retreat = pad_length_m / 2 * np.resize(RETREATS, len(row))
+    order = rng.permutation(len(row))
+    row, approach, retreat = row[order], approach[order], retreat[order]
+    middle = (contacts.first_m + contacts.second_m) / 2
+    T = np.zeros((len(row), 4, 4))
+    T[:, :3, 0] = np.cross(y[row], approach)
+    T[:, :3, 1] = y[row]
+    T[:, :3, 2] = approach
+    T[:, :3, 3] = middle[row] - retreat[:, None] * approach
+    T[:, 3, 3] = 1
+    return T, contacts.width_m[row]
+
+
+def varied(T_object_tcp: F64, n: int) -> npt.NDArray[np.int64]:
+    """Rows of at most n poses by farthest-point sampling, from the first pose on.
+
+    The distance adds those of positions and of directions of approach and closing; a grasp and its flip
+    count as one (Gonzalez 1985, Theor. Comput. Sci. 38).
+    """
+    if len(T_object_tcp) == 0 or n < 1:
+        return np.zeros(0, np.int64)
+    y, z = T_object_tcp[:, :3, 1], T_object_tcp[:, :3, 2]
+    position = np.ascontiguousarray(T_object_tcp[:, :3, 3].T)  # (3, N): sums over a long last axis are fast
+    gap = np.full(len(y), np.inf)
+    rows = [0]
+    while len(rows) < min(n, len(y)):
+        k = rows[-1]
+        apart = np.sqrt(np.square(position - position[:, k : k + 1]).sum(axis=0))
+        turned = np.arccos(np.clip(z @ z[k], -1, 1)) + np.arccos(np.clip(np.abs(y @ y[k]), 0, 1))
+        gap = np.minimum(gap, apart + _METRES_PER_RAD * turned)
+        gap[k] = -1.0
+        rows.append(int(gap.argmax()))
+    return np.array(rows)
+
+
+# Length of the approach, along which the hand is checked as one swept body.
+APPROACH_M = 0.08
+
+
+class HandClearance:
+    """Collision checks of many poses of one hand with one object's convex parts, in a bounding-box tree."""
+
+    def __init__(self, parts_m: Sequence[F32], gripper: Gripper) -> None:
+        self._tree = coal.DynamicAABBTreeCollisionManager()
+        # The tree keeps pointers only.
+        self._object = [coal.CollisionObject(polyhedron(part)) for part in parts_m]
+        for part in self._object:
+            self._tree.registerObject(part)
+        self._tree.setup()
+        left, right = gripper.finger_parts_m
+        self._hand = [
+            (coal.CollisionObject(polyhedron(swept(part))), side)
+            # The palm first: it collides most often.
+            for parts, side in ((gripper.palm_parts_m, 0.0), (left, 0.5), (right, -0.5))
+            for part in parts
+        ]
+
+    def free(self, T_object_tcp: F64, opening_m: F64 | F32) -> Bools:
+        """Whether the hand, its approach included, is free of the object at each pose (N, 4, 4); (N,)."""
+        return np.array(
+            [self._is_free(T, float(o)) for T, o in zip(T_object_tcp, opening_m, strict=True)], bool
+        )
+
+    def _is_free(self, T: F64, opening_m: float) -> bool:
+        R, p, y = T[:3, :3], T[:3, 3], T[:3, 1]
+        callback = coal.CollisionCallBackDefault()
+        for part, side in self._hand:
+            part.setRotation(R)
+            part.setTranslation(p + side * opening_m * y)
+            part.computeAABB()
+            self._tree.collide(part, callback)
+            if callback.data.result.isCollision():
+                return False
+        return True
+
+
+def swept(part_m: F32) -> F32:
+    """Corners (2V, 3) of the hull that the part (V, 3) sweeps in its last `APPROACH_M` of approach."""
+    return np.concatenate([part_m, part_m - np.array([0, 0, APPROACH_M], np.float32)])
+
+
+def lowest_m(gripper: Gripper, T_object_tcp: F64, opening_m: F64 | F32) -> F64:
+    """Lowest z (N,) of the hand in the object's frame, at the poses (N, 4, 4) and openings (N,)."""
+    down = T_object_tcp[:, 2, :3]  # the object's z axis in the TCP frame
+    left, right = gripper.finger_parts_m
+    lowest = np.full(len(down), np.inf)
+    for parts, side in ((left, 0.5), (right, -0.5), (gripper.palm_parts_m, 0.0)):
+        shift = side * np.asarray(opening_m, np.float64) * down[:, 1]
+        for part in parts:
+            lowest = np.minimum(lowest, (down @ swept(part).T.astype(np.float64)).min(axis=1) + shift)
+    return lowest + T_object_tcp[:, 2, 3]

@@ -24,10 +24,9 @@ import numpy as np
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
 from datagen.schemas.untrusted_files import open_regular, read_regular
-from datagen.workers.furniture.support_tops import CARRYING_TYPES
+from datagen.workers.furniture.assets import CARRYING_TYPES
 from datagen.workers.geometry.mesh import F32, F64, Mesh
 from datagen.workers.geometry.transforms import rotation_of
-from datagen.workers.houses.floors import MAX_CORNERS, clean_polygon
 from datagen.workers.houses.glb import MAX_FILE_BYTES, read_glb
 from datagen.workers.houses.house import House, Room, StaticBody, Surface
 from datagen.workers.houses.loader import room_ids_at
@@ -38,6 +37,7 @@ from datagen.workers.houses.mesh_geometry import (
     outlines,
     slab_parts,
 )
+from datagen.workers.houses.walls_and_floors import MAX_CORNERS, clean_polygon
 from datagen.workers.json_document import EXTENT_M, JsonNode, parse_json
 
 _SUFFIX = ".scene_instance.json"

@@ -8,9 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
-from datagen.workers.furniture.support_tops import Rectangle
-from datagen.workers.geometry.components import vertex_components
-from datagen.workers.geometry.mesh import F32, F64, Mesh
+from datagen.workers.furniture.assets import Rectangle
+from datagen.workers.geometry.mesh import F32, F64, Mesh, vertex_components
 
 MAX_PARTS = 32
 _MAX_CORNERS = 64

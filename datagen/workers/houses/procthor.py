@@ -10,8 +10,8 @@ from pathlib import Path
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
-from datagen.workers.furniture.asset_table import TABLE_NAMES, Asset, read_asset_table
-from datagen.workers.furniture.colours import hash_bytes
+from datagen.workers.furniture.assets import TABLE_NAMES, Asset, read_asset_table
+from datagen.workers.furniture.solids import hash_bytes
 from datagen.workers.houses.house import House
 from datagen.workers.houses.line_index import MAX_LINES, LineIndex, houses_cache, open_lines
 from datagen.workers.houses.loader import build_house

@@ -23,17 +23,16 @@ from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, translation, yaw_pose
-from datagen.workers.grasps.grasp import GraspSet
-from datagen.workers.grasps.grasp_cache import grasps_of
+from datagen.workers.grasps.grasp_cache import GraspSet, grasps_of
+from datagen.workers.motion import MotionPlan, PlanReport
 from datagen.workers.motion.collision import Bools
-from datagen.workers.motion.motion_plan import MotionPlan, PlanReport
 from datagen.workers.motion.plan_candidate import plan_candidate
 from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.robot import Robot
-from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.scenes import SettledScene
+from datagen.workers.trials import Disturbance, TrialResult
 from datagen.workers.trials.execute import run_trial
-from datagen.workers.trials.trial import Disturbance, TrialResult
 from datagen.workers.trials.trial_scene import TrialScene, prepare_trials
 
 _PROGRESS = tuple(OUTCOMES)  # failures in order of progress, after success

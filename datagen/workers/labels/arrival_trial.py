@@ -12,8 +12,8 @@ from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.labels.arm_labelling import ArmInScene, arm_of, fits_at
 from datagen.workers.motion.plan_candidate import plan_candidate
+from datagen.workers.trials import Disturbance
 from datagen.workers.trials.execute import run_trial
-from datagen.workers.trials.trial import Disturbance
 
 Offset = tuple[float, float, float]  # x ahead (m), y to the left (m), yaw (rad), in the frame of the goal
 

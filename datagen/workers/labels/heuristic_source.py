@@ -7,10 +7,10 @@ import numpy as np
 from datagen.schemas.cost import StageClock
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import SceneCandidates, distances
+from datagen.workers.labels import Columns, LabelSource
 from datagen.workers.labels import distance_visibility_score as formula
-from datagen.workers.labels.source import Columns, LabelSource
 from datagen.workers.rendering.visibility import visible_pixels
-from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.scenes import SettledScene
 
 
 def label(

@@ -11,7 +11,7 @@ from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.labels import heuristic_source
+from datagen.workers.labels import Columns, LabelSource, heuristic_source
 from datagen.workers.labels.arm_labelling import (
     ArmInScene,
     CandidateTrial,
@@ -19,9 +19,8 @@ from datagen.workers.labels.arm_labelling import (
     target_tcp,
     try_candidate,
 )
-from datagen.workers.labels.source import Columns, LabelSource
-from datagen.workers.motion.motion_plan import MotionPlan
-from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.motion import MotionPlan
+from datagen.workers.scenes import SettledScene
 
 # 3: four different seeds of inverse kinematics for each grasp.
 VERSION = 3

@@ -10,9 +10,8 @@ from datagen.schemas.cost import StageClock
 from datagen.schemas.outcomes import RETRY_OUTCOMES
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import SceneCandidates
-from datagen.workers.labels import plan_source
-from datagen.workers.labels.source import Columns, LabelSource
-from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.labels import Columns, LabelSource, plan_source
+from datagen.workers.scenes import SettledScene
 
 # 2: the first grasp alone decides, lift and slip are measured at the grasp, thrown objects are `unstable`.
 # 3: four different seeds of inverse kinematics for each grasp.

@@ -9,7 +9,7 @@ import numpy as np
 from datagen.schemas.specification import MotionParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.motion.collision import Bools, Hulls, Placed, hits, hulls_of
-from datagen.workers.robots.gripper import Gripper
+from datagen.workers.robots.description import Gripper
 
 # Largest error of poses by inverse kinematics: 0.5 mm, and 0.5 degrees at the palm.
 IK_SLACK_M = 0.0015

@@ -13,7 +13,7 @@ from datagen.schemas.specification import MotionParams
 from datagen.workers.bases.clearance import STEP_M
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import yaw_pose
-from datagen.workers.grasps.grasp import GraspSet
+from datagen.workers.grasps.grasp_cache import GraspSet
 from datagen.workers.houses.house import House
 from datagen.workers.motion.collision import (
     Bools,
@@ -32,7 +32,7 @@ from datagen.workers.motion.grasp_filter import Hand, can_be_lifted, free_grasps
 from datagen.workers.motion.reach_table import ReachTable, reach_table
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.robot import Robot
-from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.scenes import SettledScene
 
 _PEDESTAL_SIDES = 16
 _PEDESTAL_GAP_M = 0.02  # between the pedestal's top and the mount

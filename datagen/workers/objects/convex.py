@@ -13,8 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.untrusted_files import read_regular
-from datagen.workers.geometry.components import vertex_components
-from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.mesh import F32, F64, vertex_components
 from datagen.workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
 
 # A part thinner than this counts as a sheet: physics engines reject it or become unstable.

@@ -10,8 +10,8 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import canonical_json, digest_of
-from datagen.workers.furniture.colours import hash_bytes
-from datagen.workers.furniture.support_tops import CARRYING_TYPES, top_height_m, top_rectangles
+from datagen.workers.furniture.assets import CARRYING_TYPES, top_height_m, top_rectangles
+from datagen.workers.furniture.solids import hash_bytes
 from datagen.workers.houses.house import House
 from datagen.workers.houses.loader import build_house
 from datagen.workers.json_document import JsonNode
@@ -23,8 +23,7 @@ from datagen.workers.procedural_houses.floorplan import (
     draw_floor_plan,
 )
 from datagen.workers.procedural_houses.furniture_placement import ROOM_FURNISHERS, Furnisher
-from datagen.workers.procedural_houses.furniture_sizes import BUILTIN_ASSETS
-from datagen.workers.procedural_houses.room_layout import layout_of
+from datagen.workers.procedural_houses.room_layout import BUILTIN_ASSETS, layout_of
 
 # Part of the digest: raise it whenever the same number would give another house.
 GENERATOR_VERSION = 1

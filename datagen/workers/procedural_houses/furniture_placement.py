@@ -8,12 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from datagen.workers.furniture.asset_table import Asset
+from datagen.workers.furniture.assets import Asset, top_height_m, top_rectangles
 from datagen.workers.furniture.furniture_shapes import SOFA_SEAT_SHARE, seat_height_m
-from datagen.workers.furniture.support_tops import top_height_m, top_rectangles
 from datagen.workers.procedural_houses.floorplan import WALL_HEIGHT_M
-from datagen.workers.procedural_houses.furniture_sizes import BUILTIN_ASSETS, COUNTER_HEIGHT_M, variants_of
-from datagen.workers.procedural_houses.room_layout import RoomLayout, Spot, spot_at
+from datagen.workers.procedural_houses.room_layout import (
+    BUILTIN_ASSETS,
+    COUNTER_HEIGHT_M,
+    RoomLayout,
+    Spot,
+    spot_at,
+    variants_of,
+)
 
 # Small objects on furniture, by the type of room.
 _SMALL: dict[str, tuple[str, ...]] = {

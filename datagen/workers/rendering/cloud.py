@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from datagen.schemas.specification import ObservationParams
 from datagen.workers.geometry.mesh import F32, F64, U8
-from datagen.workers.rendering.frame import Camera, Frame, Pixels, pixel_directions
+from datagen.workers.rendering import Camera, Frame, Pixels, pixel_directions
 
 PixelCaster = Callable[[npt.NDArray[np.int64]], Pixels]
 _BLOCK = 8192

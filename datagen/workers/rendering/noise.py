@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from datagen.schemas.specification import NoiseParams
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.rendering.frame import Camera, Frame
+from datagen.workers.rendering import Camera, Frame
 
 # Matchers interpolate between pixels and report this fraction of one: a D4 camera's 1/32.
 _DISPARITY_STEP_PX = 1 / 32

@@ -11,10 +11,9 @@ import pybullet  # pyright: ignore[reportMissingImports]  # no wheels from Pytho
 from PIL import Image
 
 from datagen.schemas.errors import InputError
-from datagen.workers.geometry.mesh import F32, F64, U8, Mesh, concatenate, face_normals
+from datagen.workers.geometry.mesh import F32, F64, U8, Mesh, concatenate, face_normals, face_texture
 from datagen.workers.geometry.transforms import inverse, quaternion_wxyz
-from datagen.workers.rendering.face_texture import face_texture
-from datagen.workers.rendering.frame import Camera, Frame, SceneGeometry
+from datagen.workers.rendering import Camera, Frame, SceneGeometry
 
 # Clipping planes. A larger near distance gives more precise depth.
 _NEAR_M, _FAR_M = 0.02, 60.0

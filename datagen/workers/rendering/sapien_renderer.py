@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.workers.geometry.mesh import F64, Mesh, concatenate, face_normals
+from datagen.workers.geometry.mesh import F64, Mesh, concatenate, face_normals, face_texture
 from datagen.workers.geometry.transforms import quaternion_wxyz
-from datagen.workers.rendering.face_texture import face_texture
-from datagen.workers.rendering.frame import Camera, Frame, SceneGeometry
+from datagen.workers.rendering import Camera, Frame, SceneGeometry
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; `_the_studio` checks whether one works.

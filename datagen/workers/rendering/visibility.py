@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import look_at
-from datagen.workers.rendering.rays import MISS, RayMesh, RayScene, nearest, occluded
+from datagen.workers.rendering.embree import MISS, RayMesh, RayScene, nearest, occluded
 
 # Occluders within this depth before a hit on the target are ignored, so that rounding does not let the
 # target's support hide it.

@@ -11,7 +11,7 @@ from datagen.workers.registry import entry
 from datagen.workers.robots.description import RobotDescription, RobotLimits
 
 if TYPE_CHECKING:
-    from datagen.workers.robots.gripper import Gripper
+    from datagen.workers.robots.description import Gripper
     from datagen.workers.robots.robot import Robot
 
 ROBOTS: dict[str, str] = {

@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 from datagen.schemas.errors import InputError
 from datagen.schemas.untrusted_files import read_regular
 from datagen.workers.geometry.mesh import F32, F64, I32
-from datagen.workers.robots.gripper import Parts
+from datagen.workers.robots.description import Parts
 from datagen.workers.robots.urdf import Shape
 
 # PhysX on a GPU accepts hulls of at most 64 corners, and coal is faster on fewer.

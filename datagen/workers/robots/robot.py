@@ -1,8 +1,9 @@
-"""Robots for planner and physics: an arm on a mount, with a parallel gripper."""
+"""Robots: an arm on a mount with a gripper, its inverse kinematics and its self-collision."""
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -10,24 +11,34 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pinocchio
+from scipy.linalg import lapack
 
 from datagen.schemas.identity import digest_of
 from datagen.workers.geometry.mesh import F32, F64, Mesh, concatenate
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.houses.glb import read_glb
 from datagen.workers.robots.assembly import Assembly, LinkBody, assemble
-from datagen.workers.robots.description import HandDescription, RobotDescription
-from datagen.workers.robots.gripper import Gripper, Parts
-from datagen.workers.robots.hulls import hull_faces
-from datagen.workers.robots.inverse_kinematics import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_M, solve
+from datagen.workers.robots.description import Gripper, HandDescription, Parts, RobotDescription
+from datagen.workers.robots.hulls import hull_faces, polyhedron
 from datagen.workers.robots.robot_files import RobotFiles, hull_of
-from datagen.workers.robots.self_collision import SelfCollision
 
-# Its binary modules have no types.
+# Their binary modules have no types.
 pin: Any = pinocchio
+_lapack: Any = lapack
 _GREY = 190
 _ROUNDING_M = 0.001  # far more than the rounding errors of lengths and tolerances
 _read_visual = lru_cache(maxsize=64)(read_glb)
+POSITION_TOLERANCE_M = 0.0005
+ANGLE_TOLERANCE_RAD = float(np.radians(0.5))
+_MAX_STEPS = 40
+_LONGEST_STEP_RAD = 1.0  # of any joint
+_DAMPING = 1e-4
+_DAMPING_PER_ERROR = 0.003
+# Fails when the best error has not fallen to this share within this number of steps.
+_PATIENCE, _PROGRESS = 8, 0.7
+# Configurations in which pairs of links are checked, and the share of them in which a pair may touch.
+_SAMPLES = 300
+_MOST = 0.5
 
 
 class Robot:
@@ -201,3 +212,106 @@ def _mesh_of(body: LinkBody) -> Mesh:
 def _plain(corners_m: F32) -> Mesh:
     faces, _ = hull_faces(corners_m)
     return Mesh(corners_m, faces, np.full((len(faces), 3), _GREY, np.uint8))
+
+
+def solve(model: Any, data: Any, frame: int, T_base_tcp: F64, q_seed_rad: F64) -> F64 | None:
+    """Joints (A,) within the model's limits that put the frame at the pose (4, 4), or None.
+
+    Levenberg-Marquardt with damping that grows with the squared error (Sugihara 2011), on the pose error
+    as a twist in the frame itself; a joint at its limit stays there while the step pushes it out.
+    """
+    low, high = model.lowerPositionLimit, model.upperPositionLimit
+    goal = pin.SE3(T_base_tcp)
+    q = np.minimum(np.maximum(q_seed_rad, low), high)
+    best, best_at = np.inf, 0
+    for step in range(_MAX_STEPS):
+        pin.computeJointJacobians(model, data, q)
+        here = pin.updateFramePlacement(model, data, frame)
+        error = pin.log6(here.actInv(goal)).vector
+        # Plain floats and ndarray.dot: half of the time would go into the wrappers around them.
+        x, y, z, a, b, c = error.tolist()
+        distance, angle = x * x + y * y + z * z, a * a + b * b + c * c
+        if distance < POSITION_TOLERANCE_M**2 and angle < ANGLE_TOLERANCE_RAD**2:
+            return q
+        squared = distance + angle
+        if squared < _PROGRESS**2 * best:
+            best, best_at = squared, step
+        elif step - best_at >= _PATIENCE:
+            return None
+        J = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL)
+        H = J.dot(J.T)
+        H.flat[::7] += _DAMPING + _DAMPING_PER_ERROR * squared
+        dq = J.T.dot(_lapack.dposv(H, error)[1])
+        longest = max(map(abs, dq.tolist()))
+        if longest > _LONGEST_STEP_RAD:
+            dq *= _LONGEST_STEP_RAD / longest
+        q = np.minimum(np.maximum(q + dq, low), high)
+    return None
+
+
+class SelfCollision:
+    """Narrow-phase checks of pairs of bodies, each made of convex parts fixed to a joint.
+
+    Bodies that are fixed to one another and bodies on both sides of one joint may always touch. Other pairs
+    that touch in most of 300 random configurations (fixed seed) are left out too: their coarse hulls overlap.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        parts_m: Sequence[Parts],  # one entry a body, body frame
+        joint: Sequence[int],  # the model's joint that each body is fixed to
+        T_joint_body: Sequence[F64],
+    ) -> None:
+        self._model, self._data = model, model.createData()
+        self._geometry = pin.GeometryModel()
+        body_of: list[int] = []
+        for b, parts in enumerate(parts_m):
+            placement = pin.SE3(T_joint_body[b])
+            for part in parts:
+                name = f"{b}.{len(body_of)}"
+                shape = pin.GeometryObject(name, joint[b], placement, polyhedron(part))
+                self._geometry.addGeometryObject(shape)
+                body_of.append(b)
+        free = {
+            (a, b)
+            for a in range(len(parts_m))
+            for b in range(a + 1, len(parts_m))
+            if joint[a] != joint[b] and model.parents[joint[b]] != joint[a]
+        }
+        self._keep(free, body_of)
+        self.pairs = tuple(sorted(free - self._touching_often(body_of)))
+        self._keep(set(self.pairs), body_of)
+        self._results = self._geometry.createData()
+
+    def _keep(self, pairs: set[tuple[int, int]], body_of: list[int]) -> None:
+        self._geometry.removeAllCollisionPairs()
+        for i in range(len(body_of)):
+            for j in range(i + 1, len(body_of)):
+                if (body_of[i], body_of[j]) in pairs:
+                    self._geometry.addCollisionPair(pin.CollisionPair(i, j))
+
+    def _touching_often(self, body_of: list[int]) -> set[tuple[int, int]]:
+        results = self._geometry.createData()
+        rng = np.random.Generator(np.random.PCG64(0))
+        low, high = self._model.lowerPositionLimit, self._model.upperPositionLimit
+        pairs = [(body_of[p.first], body_of[p.second]) for p in self._geometry.collisionPairs]
+        touched: dict[tuple[int, int], int] = {}
+        for left, q in zip(
+            reversed(range(_SAMPLES)), rng.uniform(low, high, (_SAMPLES, len(low))), strict=True
+        ):
+            pin.computeCollisions(self._model, self._data, self._geometry, results, q, False)
+            found = zip(pairs, results.collisionResults, strict=True)
+            for pair in {pair for pair, result in found if result.isCollision()}:
+                touched[pair] = touched.get(pair, 0) + 1
+            # Stop when the remaining samples cannot change the result of any pair.
+            most = _MOST * _SAMPLES
+            if left <= most and all(not most - left < count <= most for count in touched.values()):
+                break
+        return {pair for pair, count in touched.items() if count > _MOST * _SAMPLES}
+
+    def touches(self, q_rad: F64) -> bool:
+        """Whether any of `pairs` touch at the joints (A,)."""
+        return bool(
+            pin.computeCollisions(self._model, self._data, self._geometry, self._results, q_rad, True)
+        )

@@ -18,7 +18,7 @@ from datagen.schemas.whole_files import whole_file
 from datagen.workers.content_cache import alone_in, cache_folder, drop_unused, refresh
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.robots.assembly import Assembly, LinkBody
-from datagen.workers.robots.gripper import Parts
+from datagen.workers.robots.description import Parts
 from datagen.workers.robots.hulls import hull_faces
 from datagen.workers.robots.urdf import Inertial, Joint, rotation_rpy
 

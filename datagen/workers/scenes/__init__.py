@@ -1,6 +1,21 @@
 """Scenes: placement, settling and observation."""
 
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
 from datagen.schemas.specification import Specification
+
+if TYPE_CHECKING:  # they load renderers, which a base installation lacks
+    from datagen.workers.geometry.mesh import F64
+    from datagen.workers.houses.house import Surface
+    from datagen.workers.objects.model import ObjectModel
+    from datagen.workers.rendering import Camera
+    from datagen.workers.rendering.cloud import Cloud
+    from datagen.workers.rendering.embree import RayScene
+    from datagen.workers.settling import SettleResult
+    from datagen.workers.world import PreparedHouse
 
 # Raise it whenever the same specification would give other scenes: a change in how houses and objects
 # are read, in placement, viewpoints or clouds. Part of every specification.
@@ -12,3 +27,59 @@ VERSION_WITHIN = 2
 def scenes_version(spec: Specification) -> int:
     """The version of the scenes that this specification gives."""
     return VERSION if spec.candidates.within is None else VERSION_WITHIN
+
+
+class SettledScene(Protocol):
+    """The input of a label source: a new `Scene`, or one read from a store. Object 0 is the target."""
+
+    @property
+    def index(self) -> int: ...
+
+    @property
+    def retry(self) -> int: ...
+
+    @property
+    def house(self) -> PreparedHouse: ...
+
+    @property
+    def models(self) -> tuple[ObjectModel, ...]: ...
+
+    @property
+    def T_world_object(self) -> F64:
+        """Settled poses (K, 4, 4)."""
+        ...
+
+    @property
+    def rays(self) -> RayScene: ...
+
+    @property
+    def target_center_m(self) -> F64:
+        """World position (3,) of the target's frame: the centre of its bounding box."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A settled and observed scene. Object 0 is the target."""
+
+    index: int
+    retry: int
+    redraws: dict[str, int]
+    house: PreparedHouse
+    surface: Surface
+    models: tuple[ObjectModel, ...]
+    settled: SettleResult
+    rays: RayScene
+    camera: Camera
+    target_visible_fraction: float
+    cloud: Cloud
+
+    @property
+    def T_world_object(self) -> F64:
+        """Settled poses (K, 4, 4)."""
+        return self.settled.T_world_object
+
+    @property
+    def target_center_m(self) -> F64:
+        """World position (3,) of the target's frame: the centre of its bounding box."""
+        return self.settled.T_world_object[0, :3, 3]

@@ -7,13 +7,25 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.specification import SceneParams
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.planar import convex_hull, stack_polygons
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.houses.house import House, Surface
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.scene_rejected import SceneRejected
+
+
+class SceneRejected(Exception):
+    """The scene is rejected and resampled; `cause` is one of REDRAW_CAUSES, `detail` optional text."""
+
+    def __init__(self, cause: str, detail: str = "") -> None:
+        if cause not in REDRAW_CAUSES:
+            raise KeyError(f"unknown redraw cause {cause!r}; causes are {', '.join(REDRAW_CAUSES)}")
+        super().__init__(cause)
+        self.cause = cause
+        self.detail = detail
+
 
 _GAP_M = 0.004  # kept between objects that are dropped side by side
 _NEAR_TRIES, _FAR_TRIES = 36, 40

@@ -16,8 +16,8 @@ from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import is_pose
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.rendering.frame import Camera, SceneGeometry
-from datagen.workers.rendering.rays import RayScene
+from datagen.workers.rendering import Camera, SceneGeometry
+from datagen.workers.rendering.embree import RayScene
 from datagen.workers.world import PreparedHouse, World
 
 Record = Mapping[str, Any]  # one row of the scene table, or the samples' columns, by field name

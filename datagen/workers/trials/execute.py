@@ -9,7 +9,8 @@ import numpy as np
 
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
-from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.motion import MotionPlan
+from datagen.workers.trials import Disturbance, Recording, TrialResult
 from datagen.workers.trials.drive_targets import (
     PHASES,
     ControlPeriod,
@@ -18,7 +19,6 @@ from datagen.workers.trials.drive_targets import (
     pressing_target_m,
 )
 from datagen.workers.trials.physics import NEAR_M, TrialWorld
-from datagen.workers.trials.trial import Disturbance, Recording, TrialResult
 from datagen.workers.trials.trial_scene import (
     TrialScene,
     disturbed_things,

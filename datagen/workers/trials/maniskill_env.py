@@ -22,10 +22,11 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
-from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.motion import MotionPlan
 from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.urdf import read_urdf
-from datagen.workers.settling.sapien_bodies import sapien_pose
+from datagen.workers.settling.sapien_physics import sapien_pose
+from datagen.workers.trials import Disturbance
 from datagen.workers.trials.drive_targets import (
     ControlPeriod,
     drive_targets,
@@ -49,7 +50,6 @@ from datagen.workers.trials.physics import (
     tune_pad,
     tune_shape,
 )
-from datagen.workers.trials.trial import Disturbance
 from datagen.workers.trials.trial_scene import TrialScene, disturbed_things, pedestal_below, still_parts_near
 
 ENV_ID = "DatagenGrasp-v1"

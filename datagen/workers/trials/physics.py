@@ -10,7 +10,7 @@ import numpy as np
 from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.robots.robot import Robot
-from datagen.workers.settling.sapien_bodies import (
+from datagen.workers.settling.sapien_physics import (
     convex_shape,
     object_body,
     pad_material,
@@ -18,9 +18,8 @@ from datagen.workers.settling.sapien_bodies import (
     sapien_pose,
     static_body,
 )
-from datagen.workers.trials.articulation import Articulation
 from datagen.workers.trials.drive_targets import FINGER_DAMPING, FINGER_STIFFNESS
-from datagen.workers.trials.trial_scene import MovableObjects
+from datagen.workers.trials.trial_scene import Articulation, MovableObjects
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.

@@ -12,10 +12,9 @@ from PIL import Image, ImageSequence
 from datagen.drawing.film import Film, filmstrip_moments, pictures
 from datagen.drawing.filmstrip import Title, write_motion, write_sheet
 from datagen.drawing.posed_robot import RobotBodies, robot_bodies
-from datagen.workers.rendering.embree_renderer import cast_pixels
-from datagen.workers.rendering.rays import RayScene
+from datagen.workers.rendering.embree import RayScene, cast_pixels
 from datagen.workers.scenes.reconstruct import ReconstructedScene
-from datagen.workers.trials.trial import Recording
+from datagen.workers.trials import Recording
 from tests.datagen.drawing.trials_to_draw import base_pose, cut, recalled, recording_of, robot
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, table_house
 

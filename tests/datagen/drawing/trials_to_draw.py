@@ -7,11 +7,11 @@ import numpy as np
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, yaw_pose
 from datagen.workers.houses.house import House
-from datagen.workers.rendering.embree_renderer import ray_scene
+from datagen.workers.rendering.embree import ray_scene
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes.reconstruct import ReconstructedScene
-from datagen.workers.trials.trial import Recording
+from datagen.workers.trials import Recording
 from datagen.workers.world import PreparedHouse
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_model, camera_at, stage_with
 

@@ -13,7 +13,7 @@ from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_reading import ShardPlace
-from datagen.workers.houses.split import split_of
+from datagen.workers.houses import split_of
 from tests.train.conftest import sim_run
 from tests.train.stream_runs import make_stream_run
 

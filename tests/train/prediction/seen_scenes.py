@@ -19,12 +19,12 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
-from datagen.workers.rendering.embree_renderer import render_rays
-from datagen.workers.rendering.frame import Camera, Frame
+from datagen.workers.rendering import Camera, Frame
+from datagen.workers.rendering.embree import render_rays
 from datagen.workers.rendering.noise import add_noise
+from datagen.workers.scenes import Scene
 from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.scenes.reconstruct import ReconstructedScene
-from datagen.workers.scenes.scene import Scene
 from datagen.workers.world import assemble_world
 
 MODEL = {"n_points": 2048, "tokens": [32, 64, 64], "width": 16, "embedding": 32, "head": [32]}

@@ -8,10 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.workers.furniture.asset_geometry import SHAPES, asset_geometry
-from datagen.workers.furniture.asset_table import Asset
-from datagen.workers.furniture.support_tops import CARRYING_TYPES, hutch_depth_m, top_height_m, top_rectangles
+from datagen.workers.furniture.assets import (
+    CARRYING_TYPES,
+    Asset,
+    hutch_depth_m,
+    top_height_m,
+    top_rectangles,
+)
 from datagen.workers.houses.house import StaticBody
-from datagen.workers.procedural_houses.furniture_sizes import BUILTIN_ASSETS
+from datagen.workers.procedural_houses.room_layout import BUILTIN_ASSETS
 from tests.workers.houses.house_checks import check_body, hull_volume, is_convex, signed_volume
 
 SIDE = st.floats(0.02, 2.5)

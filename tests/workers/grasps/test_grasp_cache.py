@@ -19,10 +19,14 @@ from hypothesis import strategies as st
 from datagen.schemas.specification import GraspParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.grasps import grasp_cache
-from datagen.workers.grasps.grasp import GraspSet
-from datagen.workers.grasps.grasp_cache import SCORED_FIRST, content_digest, grasps_of, scored_grasps
-from datagen.workers.grasps.hand_clearance import HandClearance, lowest_m
-from datagen.workers.grasps.search import BLOCK, TABLE_GAP_M
+from datagen.workers.grasps.grasp_cache import (
+    SCORED_FIRST,
+    GraspSet,
+    content_digest,
+    grasps_of,
+    scored_grasps,
+)
+from datagen.workers.grasps.search import BLOCK, TABLE_GAP_M, HandClearance, lowest_m
 from datagen.workers.objects.model import ObjectModel
 from tests.workers.grasps.shapes import bowl_model, box_gripper
 from tests.workers.worlds import box_model, box_vertices, cylinder_model, model_of

@@ -14,8 +14,7 @@ from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import pose
 from datagen.workers.grasps.contacts import Contacts
 from datagen.workers.grasps.floating_hand import PULLS, HandTest, held_trials
-from datagen.workers.grasps.hand_clearance import APPROACH_M, HandClearance, lowest_m
-from datagen.workers.grasps.hand_poses import hand_poses, varied
+from datagen.workers.grasps.search import APPROACH_M, HandClearance, hand_poses, lowest_m, varied
 from tests.workers.grasps.shapes import TIP_M, bowl_model, box_gripper
 from tests.workers.worlds import box_model, box_vertices
 

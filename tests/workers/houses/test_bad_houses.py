@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
-from datagen.workers.furniture.asset_table import Asset
-from datagen.workers.houses import furniture_bodies, line_index, open_houses
+from datagen.workers.furniture.assets import Asset
+from datagen.workers.houses import line_index, loader, open_houses
 from datagen.workers.houses.loader import build_house
 from datagen.workers.json_document import JsonNode
 from tests.workers.houses.house_files import SIZES, thing, two_rooms, write_houses, xyz
@@ -218,7 +218,7 @@ def test_a_house_that_is_not_there(tmp_path: Path):
 
 
 def test_a_house_of_more_things_than_memory_would_bear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(furniture_bodies, "MAX_BODIES", 50)
+    monkeypatch.setattr(loader, "MAX_BODIES", 50)
     document = two_rooms()
     document["objects"] = [thing(f"0|{k}", "Mug_1", xyz(1, 0.05, 1)) for k in range(60)]
     source = open_houses(f"procthor:{write_houses(tmp_path, [document])}")

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.workers.geometry.planar import inside_polygon
-from datagen.workers.houses.floors import clean_polygon, triangles
+from datagen.workers.houses.walls_and_floors import clean_polygon, triangles
 
 
 def area(p: np.ndarray) -> float:

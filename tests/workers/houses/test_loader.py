@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.workers.houses import open_houses
-from datagen.workers.houses.furniture_bodies import unity_rotation
 from datagen.workers.houses.house import House
+from datagen.workers.houses.loader import unity_rotation
 from tests.workers.houses.house_checks import check_house, covers, top_below_m
 from tests.workers.houses.house_files import thing, two_rooms, wall, write_houses, xyz
 

@@ -26,10 +26,10 @@ from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.transforms import translation
 from datagen.workers.labels import arm_labelling, load_label_source, plan_source
 from datagen.workers.labels.arm_labelling import arm_in_scene, try_candidate
-from datagen.workers.motion.motion_plan import MotionPlan
-from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.motion import MotionPlan
+from datagen.workers.scenes import SettledScene
+from datagen.workers.trials import TrialResult
 from datagen.workers.trials.execute import run_trial
-from datagen.workers.trials.trial import TrialResult
 from tests.workers.motion.tables import scene_of
 from tests.workers.worlds import box_model, on_table, table_house
 

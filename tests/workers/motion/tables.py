@@ -11,17 +11,17 @@ from scipy.spatial import ConvexHull
 from datagen.schemas.specification import MotionParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
-from datagen.workers.grasps.grasp import GraspSet
+from datagen.workers.grasps.grasp_cache import GraspSet
 from datagen.workers.houses.house import House, StaticBody
-from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.motion import MotionPlan
 from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.rendering.embree_renderer import ray_scene
-from datagen.workers.rendering.frame import SceneGeometry
+from datagen.workers.rendering import SceneGeometry
+from datagen.workers.rendering.embree import ray_scene
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.robot import Robot
+from datagen.workers.scenes import SettledScene
 from datagen.workers.scenes.reconstruct import ReconstructedScene
-from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.world import PreparedHouse
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, box_model, on_table, table_house
 

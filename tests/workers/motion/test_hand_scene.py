@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from datagen.workers.geometry.transforms import inverse
-from datagen.workers.grasps.grasp import GraspSet
-from datagen.workers.grasps.hand_clearance import HandClearance
+from datagen.workers.grasps.grasp_cache import GraspSet
+from datagen.workers.grasps.search import HandClearance
+from datagen.workers.motion import PlanReport
 from datagen.workers.motion.grasp_filter import hand_of
-from datagen.workers.motion.motion_plan import PlanReport
 from datagen.workers.motion.plan_candidate import plan_candidate
 from datagen.workers.motion.planning_scene import PlanningScene, hand_scene, prepare
-from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.scenes import SettledScene
 from tests.workers.motion.tables import (
     BOX_M,
     PARAMS,

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.grasps.grasp import GraspSet
-from datagen.workers.motion.motion_plan import PlanReport
+from datagen.workers.grasps.grasp_cache import GraspSet
+from datagen.workers.motion import PlanReport
 from datagen.workers.motion.nearby_poses import NearbyPoses
 from datagen.workers.motion.plan_candidate import plan_candidate
 from datagen.workers.motion.planning_scene import PlanningScene, prepare

@@ -10,16 +10,16 @@ import pytest
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, yaw_pose
-from datagen.workers.grasps.grasp import GraspSet
+from datagen.workers.grasps.grasp_cache import GraspSet
 from datagen.workers.houses.house import House, StaticBody
+from datagen.workers.motion import MotionPlan, PlanReport
 from datagen.workers.motion.arm_collision import surroundings
 from datagen.workers.motion.grasp_filter import backed, raised
 from datagen.workers.motion.grasp_goals import _nearest_first
-from datagen.workers.motion.motion_plan import MotionPlan, PlanReport
 from datagen.workers.motion.plan_candidate import STAGES, plan_candidate
 from datagen.workers.motion.planning_scene import prepare
 from datagen.workers.robots.robot import Robot
-from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.scenes import SettledScene
 from tests.workers.motion.tables import (
     BOX_M,
     PARAMS,

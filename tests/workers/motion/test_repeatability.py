@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from datagen.workers.motion.motion_plan import PlanReport
+from datagen.workers.motion import PlanReport
 from datagen.workers.motion.plan_candidate import plan_candidate
 from datagen.workers.motion.planning_scene import PlanningScene
-from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.scenes import SettledScene
 from tests.workers.motion.tables import arm, deepest_in_plan_m, front_base, prepared, table_scene
 from tests.workers.worlds import ROOM_M, box_body
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import Mesh, Texture
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.rendering.frame import Camera, Frame, SceneGeometry
+from datagen.workers.rendering import Camera, Frame, SceneGeometry
 from tests.workers.worlds import ball_model, box_model, camera_at, cylinder_model, stage_with
 
 QUADRANTS = {"low_u_low_v": (200, 20, 20), "high_u_low_v": (20, 200, 20), "low_u_high_v": (20, 20, 200)}

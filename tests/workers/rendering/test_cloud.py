@@ -7,7 +7,7 @@ import pytest
 
 from datagen.schemas.specification import ObservationParams
 from datagen.workers.rendering.cloud import Cloud, caster_of, farthest_points, observe_cloud, target_pixels
-from datagen.workers.rendering.embree_renderer import cast_pixels, ray_scene, render_rays
+from datagen.workers.rendering.embree import cast_pixels, ray_scene, render_rays
 from tests.workers.worlds import ball_model, box_model, camera_at, stage_with
 
 STAGE = stage_with([box_model("target", (0.06, 0.06, 0.1)), ball_model("ball", 0.05)], [(0, 0), (0.15, 0.05)])

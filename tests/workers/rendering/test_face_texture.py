@@ -6,8 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.workers.geometry.mesh import Mesh, face_normals
-from datagen.workers.rendering.face_texture import face_texture
+from datagen.workers.geometry.mesh import Mesh, face_normals, face_texture
 
 
 @settings(max_examples=25, deadline=None)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from datagen.schemas.specification import NoiseParams
 from datagen.workers.geometry.mesh import F32
-from datagen.workers.rendering.embree_renderer import render_embree
-from datagen.workers.rendering.frame import Camera, Frame
+from datagen.workers.rendering import Camera, Frame
+from datagen.workers.rendering.embree import render_embree
 from datagen.workers.rendering.noise import add_noise
 from tests.workers.worlds import box_model, camera_at, stage_with
 

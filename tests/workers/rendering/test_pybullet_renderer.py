@@ -11,8 +11,8 @@ pybullet = pytest.importorskip("pybullet", reason="pybullet has no wheels from P
 # ruff: noqa: E402
 
 from datagen.workers.geometry.mesh import Mesh
-from datagen.workers.rendering.embree_renderer import ray_scene, render_embree
-from datagen.workers.rendering.frame import Camera, SceneGeometry
+from datagen.workers.rendering import Camera, SceneGeometry
+from datagen.workers.rendering.embree import ray_scene, render_embree
 from datagen.workers.rendering.pybullet_renderer import render_pybullet
 from datagen.workers.rendering.visibility import visible_pixels
 from tests.workers.rendering.engines import assert_same_hues, assert_same_view, cameras, mixed_stage

@@ -13,8 +13,8 @@ pytest.importorskip(
 )
 
 from datagen.schemas.errors import InputError
-from datagen.workers.rendering.embree_renderer import render_embree
-from datagen.workers.rendering.frame import Camera, Frame, SceneGeometry
+from datagen.workers.rendering import Camera, Frame, SceneGeometry
+from datagen.workers.rendering.embree import render_embree
 from datagen.workers.rendering.sapien_renderer import render_sapien
 from tests.conftest import REPOSITORY
 from tests.workers.rendering.engines import assert_same_hues, assert_same_view, cameras, mixed_stage

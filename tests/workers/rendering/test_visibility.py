@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.workers.rendering.embree_renderer import ray_scene
-from datagen.workers.rendering.frame import SceneGeometry
+from datagen.workers.rendering import SceneGeometry
+from datagen.workers.rendering.embree import ray_scene
 from datagen.workers.rendering.visibility import visible_pixels
 from tests.independent import pixel_counts
 from tests.workers.worlds import (

@@ -8,8 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.schemas.specification import SceneParams
-from datagen.workers.scene_rejected import SceneRejected
-from datagen.workers.scenes.placement import drop_poses, eligible_surfaces, nearby_parts, standing_footprints
+from datagen.workers.scenes.placement import (
+    SceneRejected,
+    drop_poses,
+    eligible_surfaces,
+    nearby_parts,
+    standing_footprints,
+)
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, box_model, cylinder_model, table_house
 
 MODELS = [

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import pose
-from datagen.workers.settling.inertia import MassProperties, mass_properties
+from datagen.workers.settling.pybullet_settler import MassProperties, mass_properties
 from tests.workers.worlds import ball_model, box_vertices, cylinder_model
 
 edge = st.floats(0.02, 0.4)

@@ -15,8 +15,8 @@ from datagen.schemas.specification import SettleParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import translation, yaw_pose
 from datagen.workers.objects.model import ObjectModel
+from datagen.workers.settling import SettleResult
 from datagen.workers.settling.pybullet_settler import settle_pybullet
-from datagen.workers.settling.settler import SettleResult
 from tests.workers.worlds import (
     TABLE_TOP_M,
     ball_model,
@@ -62,7 +62,7 @@ def test_things_rest_at_half_their_height_without_a_margin() -> None:
 
 def test_resting_places_agree_with_physx() -> None:
     pytest.importorskip("sapien", reason="SAPIEN cannot be imported here", exc_type=ImportError)
-    from datagen.workers.settling.sapien_settler import settle_sapien
+    from datagen.workers.settling.sapien_physics import settle_sapien
 
     models, poses = three_objects()
     models.append(bent())

@@ -11,10 +11,10 @@ pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datag
 
 from datagen.schemas.specification import SettleParams
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.scene_rejected import SceneRejected
 from datagen.workers.scenes.generate import check_settled
-from datagen.workers.settling.sapien_settler import settle_sapien
-from datagen.workers.settling.settler import SettleResult
+from datagen.workers.scenes.placement import SceneRejected
+from datagen.workers.settling import SettleResult
+from datagen.workers.settling.sapien_physics import settle_sapien
 from tests.workers.worlds import TABLE_TOP_M, ball_model, box_model, cylinder_model, on_table, table_house
 
 PARAMS = SettleParams()

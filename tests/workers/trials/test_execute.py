@@ -12,12 +12,12 @@ pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datag
 from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import translation, yaw_pose
-from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.motion import MotionPlan
 from datagen.workers.robots import open_robot
-from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.scenes import SettledScene
+from datagen.workers.trials import Disturbance, TrialResult
 from datagen.workers.trials.execute import run_trial
 from datagen.workers.trials.physics import TrialWorld
-from datagen.workers.trials.trial import Disturbance, TrialResult
 from datagen.workers.trials.trial_scene import prepare_trials
 from tests.workers.trials.worlds import base_before, on_top_m, plan_from_above, scene_with
 from tests.workers.worlds import TABLE_TOP_M, box_body, box_model

@@ -15,10 +15,10 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import translation
-from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.motion import MotionPlan
 from datagen.workers.robots import open_robot
+from datagen.workers.trials import Disturbance
 from datagen.workers.trials.execute import run_trial
-from datagen.workers.trials.trial import Disturbance
 from datagen.workers.trials.trial_scene import TrialScene, prepare_trials
 from tests.workers.trials.worlds import base_before, on_top_m, plan_from_above, scene_with
 from tests.workers.worlds import box_model, cylinder_model

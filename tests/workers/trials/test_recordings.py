@@ -22,11 +22,11 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, translation
 from datagen.workers.houses import open_houses
 from datagen.workers.labels.arm_labelling import ArmInScene, arm_in_scene, try_candidate
-from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.motion import MotionPlan
 from datagen.workers.motion.planning_scene import pose_of_base
 from datagen.workers.objects import open_objects
 from datagen.workers.scenes.generate import generate_scene
-from datagen.workers.trials.trial import Recording, TrialResult
+from datagen.workers.trials import Recording, TrialResult
 from datagen.workers.world import assemble_world
 from tests.workers.motion.tables import HalfSpaces
 

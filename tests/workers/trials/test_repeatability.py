@@ -15,9 +15,9 @@ from sapien import physx
 from datagen.schemas.specification import SettleParams, TrialParams
 from datagen.workers.geometry.transforms import translation, yaw_pose
 from datagen.workers.robots import open_robot
-from datagen.workers.settling.sapien_settler import settle_sapien
+from datagen.workers.settling.sapien_physics import settle_sapien
+from datagen.workers.trials import Disturbance
 from datagen.workers.trials.execute import run_trial
-from datagen.workers.trials.trial import Disturbance
 from datagen.workers.trials.trial_scene import prepare_trials
 from tests.workers.trials.worlds import base_before, on_top_m, plan_from_above, scene_with
 from tests.workers.worlds import ball_model, box_model, cylinder_model

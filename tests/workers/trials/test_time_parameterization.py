@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from datagen.workers.trials.time_parameterization import SPEED_UP_S, lag_compensated, time_parameterized
+from datagen.workers.trials.drive_targets import SPEED_UP_S, lag_compensated, time_parameterized
 
 PERIOD_S = 0.05
 SPEED = np.array([1.0, 0.5, 2.0])

@@ -9,10 +9,10 @@ import numpy as np
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, translation, yaw_pose
 from datagen.workers.houses.house import StaticBody
-from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.motion import MotionPlan
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.robot import Robot
-from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.scenes import SettledScene
 from tests.workers.motion.tables import scene_of
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, on_table, table_house
 
