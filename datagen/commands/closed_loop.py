@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from datagen.console.command_lines import print_interrupted
+from datagen.console.command_lines import interruptible, print_interrupted
 from datagen.console.options import (
     AS_FOUND,
     AsJson,
@@ -99,7 +99,6 @@ def closed_loop(
     from datagen.evaluation_report.methods import baseline_methods, open_models, read_heuristic
     from datagen.evaluation_report.scoring import score_runs
     from datagen.train.arrivals import read_arrival
-    from datagen.train.training.launching import interruptible
 
     refuse_missing_packages(mode)
     fit_on = [str(path) for path in fit or ()]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, fields
+from dataclasses import KW_ONLY, asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
 
@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from pydantic import TypeAdapter, ValidationError
 
 from datagen.configuration.specify import parse_toml, read_toml
-from datagen.console.command_lines import Interrupted, print_interrupted, prints
+from datagen.console.command_lines import Interrupted, interruptible, options_of, print_interrupted, prints
 from datagen.console.options import AllowIncomplete, AsJson, File, PathOrAddress, PathsOrAddresses, Whole
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.released import checkpoint_file
@@ -22,7 +22,6 @@ from datagen.schemas.errors import InputError, choices
 if TYPE_CHECKING:
     from datagen.train.augment import Augmentation
     from datagen.train.training.checkpoints import CheckpointHead, EpochRecord
-    from datagen.train.training.training_setup import TrainingJob
 else:
     CheckpointHead = Any  # the command line resolves it, without importing torch
 
@@ -76,43 +75,9 @@ def _rows(head: CheckpointHead, best: EpochRecord | None) -> Iterator[tuple[str,
     yield "cost", f"{seconds(head.cost.get('label_cpu_s', 0.0))} of CPU for labels, {seconds(cpu_s)} to train"
 
 
-@prints(print_training)
-def train_model(
-    stage: Annotated[Literal["stage1", "stage2", "sim-only"], Parameter(name="STAGE")],
-    runs: Annotated[Sequence[str | Path], Parameter(name="RUN...")],
-    /,
-    *,
-    out: File,
-    val: PathsOrAddresses | None = None,
-    init: File | None = None,
-    model: Literal["paper", "shared", "n2m"] | None = None,
-    model_config: Sequence[str] | None = None,
-    epochs: Whole | None = None,
-    batch_scenes: Whole = 16,
-    house_share: float = 1.0,
-    candidates_per_robot: Whole | None = None,
-    lr: float | None = None,
-    weight_decay: float | None = None,
-    seed: Whole = 0,
-    patience: Whole = 8,
-    augment: str | None = None,
-    encoded: PathOrAddress | None = None,
-    device: Literal["auto", "cpu", "cuda"] = "auto",
-    processes: Whole | None = None,
-    threads: Whole | None = None,
-    tensorboard: PathOrAddress | None = None,
-    allow_incomplete: AllowIncomplete = False,
-    allow_mixed_labels: bool = False,
-    json: AsJson = False,
-) -> CheckpointHead:
-    """Train a model; the checkpoint records the data, settings and history.
-
-    stage1 trains on heuristic labels with class-weighted cross-entropy; stage2 continues from a checkpoint on
-    sim or plan labels with cross-entropy and weight decay; sim-only is stage2 from scratch. Training stops
-    when the loss on held-out houses no longer falls, and the best epoch's weights are used. After Ctrl-C, the
-    same command resumes.
-
-    For example: datagen train stage1 runs/first --out model.ckpt
+@dataclass(frozen=True)
+class TrainOptions:
+    """Options of `train_model`.
 
     Args:
         stage: Heuristic labels, then sim labels, or sim labels alone.
@@ -123,22 +88,63 @@ def train_model(
         model: Architecture [shared, or that of --init].
         model_config: Sizes of the model: a TOML file, or field=value; repeat for more.
         epochs: Epochs [12 in stage1, else 20].
-        batch_scenes: Scenes per step, over all processes.
         house_share: Share of the houses to train on, for learning curves.
-        candidates_per_robot: Candidates sampled per robot per epoch [all].
         lr: Highest learning rate [0.002; 0.001 in stage2].
-        weight_decay: Weight decay [0 in stage1, else 0.01].
         seed: Seed of weights, order and dropout.
-        patience: Epochs without a lower validation loss before training stops.
         augment: noise, holes, dropout, colour, rotation, comma-separated; or a TOML file.
         encoded: Folder for encoded inputs of `shared`: written once, read by later trainings.
         device: Device of the model.
-        processes: Training processes [one per GPU; one on CPUs].
-        threads: Threads per process [cores / processes].
-        tensorboard: Folder for TensorBoard logs.
+        threads: Threads [all cores].
         allow_incomplete: Accept runs that lack planned samples instead of failing.
-        allow_mixed_labels: Accept labels of one source in different versions instead of failing.
         json: Report progress as JSON lines.
+    """
+
+    stage: Annotated[Literal["stage1", "stage2", "sim-only"], Parameter(name="STAGE")]
+    runs: Annotated[Sequence[str | Path], Parameter(name="RUN...")]
+    _: KW_ONLY
+    out: File
+    val: PathsOrAddresses | None = None
+    init: File | None = None
+    model: Literal["paper", "shared", "n2m"] | None = None
+    model_config: Sequence[str] | None = None
+    epochs: Whole | None = None
+    house_share: float = 1.0
+    lr: float | None = None
+    seed: Whole = 0
+    augment: str | None = None
+    encoded: PathOrAddress | None = None
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    threads: Whole | None = None
+    allow_incomplete: AllowIncomplete = False
+    json: AsJson = False
+
+    def __post_init__(self) -> None:
+        """Raise InputError for options that do not fit."""
+        if not self.runs:
+            raise InputError("datagen train", "RUN", "is missing", "Name one or more run folders")
+        if self.threads is not None and not 1 <= self.threads <= 1024:
+            fix = "Give 1 or more, or leave it out"
+            raise InputError("datagen train", "--threads", f"{self.threads}", fix)
+        if self.stage == "stage2" and self.init is None:
+            problem = "is missing: stage2 starts from a checkpoint"
+            fix = "Give --init CKPT or --init released, or train sim-only"
+            raise InputError("datagen train", "--init", problem, fix)
+        if self.stage != "stage2" and self.init is not None:
+            problem = f"does not apply: {self.stage} starts from random weights"
+            raise InputError("datagen train", "--init", problem, "Omit it, or train stage2")
+
+
+@prints(print_training)
+@options_of(TrainOptions)
+def train_model(given: TrainOptions) -> CheckpointHead:
+    """Train a model; the checkpoint records the data, settings and history.
+
+    stage1 trains on heuristic labels with class-weighted cross-entropy; stage2 continues from a checkpoint on
+    sim or plan labels with cross-entropy and weight decay; sim-only is stage2 from scratch. Training stops
+    when the loss on held-out houses no longer falls, and the best epoch's weights are used. After Ctrl-C, the
+    same command resumes.
+
+    For example: datagen train stage1 runs/first --out model.ckpt
 
     Returns:
         The metadata of the checkpoint.
@@ -154,75 +160,46 @@ def train_model(
         >>> head.finished, head.epoch, len(head.history)
         (True, 1, 1)
     """
-    if not runs:
-        raise InputError("datagen train", "RUN", "is missing", "Name one or more run folders")
-    each = share_cores(processes, threads)
+    threads = given.threads or _all_cores()
+    # Imported here: torch takes seconds to import, and reads the variables that were set above.
     from datagen.train.training.checkpoints import read_checkpoint
-    from datagen.train.training.launching import choose_device
     from datagen.train.training.options import STAGES, Options
-    from datagen.train.training.training_setup import TrainingJob
+    from datagen.train.training.training_setup import TrainingJob, choose_device, train_job
 
-    chosen = STAGES[stage]
-    _refuse_odd_init(stage, init, chosen.from_checkpoint)
-    start = None if init is None else checkpoint_file(str(init)) or str(init)
+    stage = STAGES[given.stage]
+    start = None if given.init is None else checkpoint_file(str(given.init)) or str(given.init)
     began = read_checkpoint(start).head if start else None
-    augmentation, effects = read_augmentation(augment)
+    augmentation, effects = read_augmentation(given.augment)
     options = Options(
-        stage=stage,
-        model=model or (began.model if began else "shared"),
-        model_config={**(began.model_config if began else {}), **model_sizes(model_config or ())},
-        epochs=chosen.epochs if epochs is None else epochs,
-        batch_scenes=batch_scenes,
-        house_share=house_share,
-        candidates_per_robot=candidates_per_robot,
-        lr=chosen.lr if lr is None else lr,
-        weight_decay=chosen.weight_decay if weight_decay is None else weight_decay,
-        seed=seed,
-        patience=patience,
+        stage=given.stage,
+        model=given.model or (began.model if began else "shared"),
+        model_config={**(began.model_config if began else {}), **model_sizes(given.model_config or ())},
+        epochs=stage.epochs if given.epochs is None else given.epochs,
+        house_share=given.house_share,
+        lr=stage.lr if given.lr is None else given.lr,
+        weight_decay=stage.weight_decay,
+        seed=given.seed,
         augment=effects,
     )
-    options.refuse_bad()
-    where, n_processes = choose_device(device, processes)
     job = TrainingJob(
         options,
-        tuple(map(str, runs)),
-        tuple(map(str, val or ())),
-        str(out),
+        tuple(map(str, given.runs)),
+        tuple(map(str, given.val or ())),
+        str(given.out),
         augmentation,
         start,
-        where,
-        each,
-        tensorboard=None if tensorboard is None else str(tensorboard),
-        json_lines=json,
-        allow_incomplete=allow_incomplete,
-        allow_mixed_labels=allow_mixed_labels,
-        encoded=None if encoded is None else str(encoded),
+        choose_device(given.device),
+        threads,
+        json_lines=given.json,
+        allow_incomplete=given.allow_incomplete,
+        encoded=None if given.encoded is None else str(given.encoded),
     )
-    if not _train(job, n_processes):
-        head = read_checkpoint(out).head if Path(out).exists() else None
-        raise Interrupted(f"Training stopped; the same call on {out} continues it", head)
-    return read_checkpoint(out).head
-
-
-def _refuse_odd_init(stage: str, init: str | Path | None, needs_one: bool) -> None:
-    if init is None and needs_one:
-        problem = f"is missing: {stage} starts from a checkpoint"
-        fix = "Give --init CKPT or --init released, or train sim-only"
-        raise InputError("datagen train", "--init", problem, fix)
-    if init is not None and not needs_one:
-        problem = f"does not apply: {stage} starts from random weights"
-        raise InputError("datagen train", "--init", problem, "Omit it, or train stage2")
-
-
-def _train(job: TrainingJob, processes: int) -> bool:
-    """Run the training; True when it finished, False when it was interrupted."""
-    from datagen.train.training.launching import Ranks, interruptible, train_in_processes
-    from datagen.train.training.training_setup import train_job
-
     with interruptible() as stopping:
-        if processes == 1:
-            return train_job(job, Ranks(), stopping)
-        return train_in_processes(train_job, job, processes, job.device, stopping)
+        finished = train_job(job, stopping)
+    head = read_checkpoint(given.out).head if Path(given.out).exists() else None
+    if head is None or not finished:
+        raise Interrupted(f"Training stopped; the same call on {given.out} continues it", head)
+    return head
 
 
 def model_sizes(words: Sequence[str]) -> dict[str, Any]:
@@ -266,21 +243,13 @@ def read_augmentation(word: str | None) -> tuple[Augmentation | None, dict[str, 
     return Augmentation(**effects), {name: asdict(effect) for name, effect in effects.items()}
 
 
-def share_cores(processes: int | None, threads: int | None) -> int:
-    """Return the threads of each process: those given, or an equal share of the cores.
+def _all_cores() -> int:
+    """Return the number of cores, and bind torch's threads to them, since unbound ones may share a core.
 
-    Call it before torch is imported. The threads of a single process are bound to cores, since unbound ones
-    may share a core for minutes; those of several processes are not, since each would start at the first
-    core.
+    Call it before torch is imported.
     """
     cores = len(os.sched_getaffinity(0))
-    for option, value in (("--processes", processes), ("--threads", threads)):
-        if value is not None and not 1 <= value <= 1024:
-            raise InputError("datagen train", option, f"{value}", "Give 1 or more, or leave it out")
-    each = threads or max(1, cores // (processes or 1))
-    if (processes or 1) == 1 and each == cores > 1:
+    if cores > 1:
         os.environ.setdefault("OMP_PROC_BIND", "true")
         os.environ.setdefault("OMP_PLACES", "cores")
-    elif processes is not None and processes > 1:
-        os.environ.setdefault("OMP_NUM_THREADS", str(each))
-    return each
+    return cores

@@ -2,14 +2,51 @@
 
 from __future__ import annotations
 
+import inspect
 import shlex
+import signal
 import sys
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from functools import wraps
+from threading import current_thread, main_thread
+from types import FrameType
+from typing import Any, ParamSpec, TypeVar, get_type_hints
 
 Verb = TypeVar("Verb", bound=Callable[..., Any])
+Parameters = ParamSpec("Parameters")
+Options = TypeVar("Options")
+Result = TypeVar("Result")
 PRINTER = "print_result"
+
+
+def options_of(
+    kind: Callable[Parameters, Options],
+) -> Callable[[Callable[[Options], Result]], Callable[Parameters, Result]]:
+    """Give a verb the arguments of a dataclass, `kind`, in Python and on the command line.
+
+    The verb gets the dataclass as its only argument. Fields before `KW_ONLY` are positional; the section
+    `Args:` of the dataclass's docstring is their help, and `__post_init__` checks them.
+    """
+
+    def with_options(verb: Callable[[Options], Result]) -> Callable[Parameters, Result]:
+        @wraps(verb)
+        def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+            return verb(kind(*args, **kwargs))
+
+        hints = get_type_hints(kind, include_extras=True)
+        only = {inspect.Parameter.POSITIONAL_OR_KEYWORD: inspect.Parameter.POSITIONAL_ONLY}
+        parameters = [
+            each.replace(annotation=hints[name], kind=only.get(each.kind, each.kind))
+            for name, each in inspect.signature(kind).parameters.items()
+        ]
+        arguments = (inspect.getdoc(kind) or "").partition("\n\n")[2]
+        vars(call)["__signature__"] = inspect.Signature(parameters)
+        call.__doc__ = f"{inspect.getdoc(verb)}\n\n{arguments}\n"
+        call.__annotations__ = hints
+        return call
+
+    return with_options
 
 
 def prints(printer: Callable[..., int]) -> Callable[[Verb], Verb]:
@@ -67,3 +104,22 @@ def resumable(words: Sequence[str]) -> Generator[None]:
     except KeyboardInterrupt:
         print_interrupted("; committed shards are kept", words)
         raise
+
+
+@contextmanager
+def interruptible() -> Generator[Callable[[], bool]]:
+    """Yield a function that returns whether Ctrl-C or SIGTERM came. A second Ctrl-C ends the block."""
+    came = False
+
+    def note(_number: int, _frame: FrameType | None) -> None:
+        nonlocal came
+        came = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    numbers = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
+    before = {number: signal.signal(number, note) for number in numbers}
+    try:
+        yield lambda: came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

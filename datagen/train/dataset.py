@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Annotated, NotRequired
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -92,8 +92,7 @@ class DataOrigin(TypedDict):
 
     `samples_sha256` is over the ids and labels of the selected samples, in stored order: the same for a run,
     its copy and its sealed store. `cost` has the wall and CPU seconds of the whole run; None for a sealed
-    store without its run. `robots` has the least and the largest value of `ROBOT_SIZES` in metres; older
-    checkpoints lack it.
+    store without its run. `robots` has the least and the largest value of `ROBOT_SIZES` in metres.
     """
 
     spec_hashes: list[str]
@@ -103,7 +102,7 @@ class DataOrigin(TypedDict):
     n_scenes: int
     samples_sha256: str
     cost: dict[str, float] | None
-    robots: NotRequired[dict[str, Annotated[list[float], Field(min_length=2, max_length=2)]]]
+    robots: dict[str, Annotated[list[float], Field(min_length=2, max_length=2)]]
 
 
 # Fields of a specification's candidates, in which the robots of a run differ.
@@ -167,10 +166,6 @@ class SampleStream:
         self._shards = [(s, {n: p.arrays[n] for n in names}) for p in parts for s in p.shards]
         self._dims = {name: parts[0].arrays[name].dims[0] for name in names}
         self._scenes = read_scene_table(parts, candidates_per_robot, houses)
-        self.use_rank(rank, world)
-
-    def use_rank(self, rank: int, world: int) -> None:
-        """Give the batches of one of `world` ranks. InputError where there are fewer scenes than ranks."""
         if not 0 <= rank < world:
             raise InputError("training data", "rank", f"{rank} of {world}", "Number ranks from 0")
         if len(self._scenes) < world:

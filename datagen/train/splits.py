@@ -50,10 +50,10 @@ def split_by_house(
     """(training, validation) streams of runs: nine tenths of the houses, and the tenth that is held out.
 
     `share` is the part of the nine tenths to train on. `options` are those of SampleStream for training;
-    validation is neither shuffled nor augmented and has all its candidates. InputError where a side has no
+    validation is neither shuffled nor augmented. InputError where a side has no
     house.
     """
-    plain: dict[str, Any] = {"shuffle": False, "augment": None, "candidates_per_robot": None}
+    plain: dict[str, Any] = {"shuffle": False, "augment": None}
     try:
         validation = SampleStream(paths, **(options | plain), houses=HouseSide(held_out=True))
         train = SampleStream(paths, **options, houses=HouseShare(share, HouseSide(held_out=False)))

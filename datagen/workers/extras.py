@@ -45,7 +45,6 @@ EXTRAS: dict[str, Extra] = {
         {
             "torch": "torch",
             "safetensors": "safetensors",
-            "tensorboard": "tensorboard",
             "plotly": "plotly",
             **_PICTURES,
         },

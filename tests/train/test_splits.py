@@ -62,12 +62,12 @@ def test_one_run_is_divided_by_house(tmp_path: Path):
         ):
             split_by_house([tmp_path / name])
     make_stream_run(tmp_path / "run", 6 * 18)
-    options = {"augment": Augmentation(rotation=Rotation()), "candidates_per_robot": 1}
+    options = {"augment": Augmentation(rotation=Rotation())}
     places = [tmp_path / name for name in ("run", "in", "out")]
     train, validation = split_by_house(places, scenes_per_batch=4, seed=3, **options)
     assert not train.house_ids() & validation.house_ids()
     assert train.n_scenes + validation.n_scenes == 24
-    assert (validation.shuffle, validation.augment, validation.candidates_per_robot) == (False, None, None)
+    assert (validation.shuffle, validation.augment) == (False, None)
     assert (train.shuffle, train.seed, validation.seed) == (True, 3, 3)
     # Twins by content under two names, one on each side.
     make_stream_run(tmp_path / "twin", 18, seed=6, house_digest="in", house_id=twin)

@@ -2,8 +2,7 @@
 
 On disk it is a safetensors file: tensors under `weights/` (the best epoch's) and `resume/` (the last step's
 model and optimiser), and in the header's metadata one JSON text, `head`. Other numbers and the file's
-checksum are in the JSON, which keeps every bit of a float. `pickled_checkpoints` reads files of format 1,
-which `torch.save` wrote.
+checksum are in the JSON, which keeps every bit of a float.
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ from datagen.schemas.untrusted_files import read_regular
 from datagen.schemas.whole_files import whole_file
 from datagen.train.dataset import DataOrigin
 from datagen.train.models import Model, build_model
-from datagen.train.training.pickled_checkpoints import NOT_PICKLED, read_pickled
 from datagen.train.training.validation import ValidationMetrics
 
 FORMAT, FORMAT_VERSION = "datagen checkpoint", 2
@@ -42,8 +40,16 @@ _UNSIGNED = b"0" * 64  # stands for the checksum while it is computed
 _NO_TEXT = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 _MAX_TEXT = 4096
 _FIX = "Name a checkpoint of `datagen train`, or train it again"
-# Fields that were added to a model's configuration later, with their values for older models.
-_OLDER_CONFIGS: dict[str, dict[str, Any]] = {"shared": {"hand_poses": 0}}
+# Errors from reading a file of another kind, or a damaged one.
+_NOT_READ = (
+    SafetensorError,
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
 
 
 class EpochRecord(ValidationMetrics):
@@ -122,8 +128,8 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     """Load a complete checkpoint on the CPU. InputError as `load_model`; memory is bounded by its size."""
     place, data = str(path), read_regular(Path(path), MAX_BYTES, _FIX)
     try:
-        tensors, text = read_pickled(data) if data[:2] == b"PK" else _read(data)
-    except (SafetensorError, *NOT_PICKLED, AttributeError) as e:
+        tensors, text = _read(data)
+    except _NOT_READ as e:
         problem = f"not a datagen checkpoint, or damaged ({e!s:.200})"
         raise InputError(place, "", problem, _FIX) from None
     document = _document(place, text)
@@ -135,7 +141,6 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         where = ".".join(str(part) for part in first["loc"]) if first else "head"
         problem = first["msg"].lower() if first else f"incomplete ({e})"
         raise InputError(place, where, problem, _FIX) from None
-    head = replace(head, model_config={**_OLDER_CONFIGS.get(head.model, {}), **head.model_config})
     _refuse_not_finite(place, tensors, _FIX)
     return Checkpoint(head, below("weights/", tensors), below("resume/", tensors), loop)
 
@@ -222,8 +227,8 @@ def _document(place: str, text: object) -> dict[str, Any]:
         raise InputError(place, "head", "is not that of a datagen checkpoint", _FIX)
     _refuse_odd_values(place, document)
     version = document.get("format_version")
-    if version not in (1, FORMAT_VERSION):
-        problem = f"is {version!r:.20}, but this program reads 1 and {FORMAT_VERSION}"
+    if version != FORMAT_VERSION:
+        problem = f"is {version!r:.20}, but this program reads {FORMAT_VERSION}"
         raise InputError(place, "format_version", problem, "Use the version of datagen that wrote it")
     return document
 

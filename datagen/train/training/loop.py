@@ -1,7 +1,7 @@
 """The training loop: batches, steps, validation, early stopping, and a position to resume from.
 
 No random state is saved: batches follow from seed and epoch, and the random numbers of a step (dropout)
-from seed, epoch, batch and rank.
+from seed, epoch and batch.
 """
 
 from __future__ import annotations
@@ -21,11 +21,10 @@ from datagen.train.inputs import Array, Batch
 from datagen.train.models import Model
 from datagen.train.rates import label_losses
 from datagen.train.tensors import to_torch
-from datagen.train.training.callbacks import TrainingCallback, TrainingStep
 from datagen.train.training.checkpoints import EpochRecord
-from datagen.train.training.launching import Ranks
 from datagen.train.training.optimiser import rate_at, set_rate
 from datagen.train.training.options import Options
+from datagen.train.training.training_progress import TrainingCallback, TrainingStep
 from datagen.train.training.validation import validate
 
 _STEP_STREAM = 0x57E9  # separates the random numbers of steps from those of batches
@@ -67,7 +66,6 @@ class Training:
     val: Batches
     class_weights: Tensor  # (2,) float32, on the model's device
     position: Position
-    ranks: Ranks
 
 
 def run_training(
@@ -83,16 +81,16 @@ def run_training(
     that is not finite, before it reaches the weights.
     """
     at, clock = training.position, _Clock()
-    logits_of = training.ranks.share_gradients(training.model)
     training.model.train()
     kept_s = time.monotonic()
     while not at.finished:
         wait_began_s = time.perf_counter()
         for batch in training.train.epoch(at.epoch, at.batch):
             clock.waited_from(wait_began_s)
-            seen, stop = _step(training, logits_of, batch, clock, stopping())
+            stop = stopping()
+            step = _step(training, batch, clock)
             for callback in callbacks:
-                callback.step(seen)
+                callback.step(step)
             if stop or time.monotonic() - kept_s >= save_every_s:
                 save()
                 kept_s = time.monotonic()
@@ -106,30 +104,25 @@ def run_training(
     return True
 
 
-def _step(
-    training: Training, logits_of: Callable[..., Tensor], batch: Batch[Array], clock: _Clock, stopping: bool
-) -> tuple[TrainingStep, bool]:
-    """Take a step on the batches of all ranks as one batch; the step, and whether any rank stops."""
-    options, at, ranks, device = training.options, training.position, training.ranks, training.model.device
-    torch.manual_seed(_seed(options.seed, at.epoch, at.batch, ranks.rank))
+def _step(training: Training, batch: Batch[Array], clock: _Clock) -> TrainingStep:
+    """Take a step on a batch. InputError at a loss or gradient that is not finite."""
+    options, at, device = training.options, training.position, training.model.device
+    torch.manual_seed(_seed(options.seed, at.epoch, at.batch, 0))
     given = to_torch(batch, device)
     with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
-        logits = logits_of(given.clouds, given.candidates, given.robots)
+        logits = training.model(given.clouds, given.candidates, given.robots)
     losses = label_losses(logits.float(), given)
     weights = training.class_weights[given.label]
     loss = (weights * losses).sum()
     hits = (logits.argmax(dim=1) == given.label).sum()
-    mine = [float(weights.sum()), loss.item(), float(hits), float(len(batch)), *clock.lap(), float(stopping)]
-    *sums, wall_s, cpu_s, wait_s, stop = ranks.total(
-        torch.tensor(mine, dtype=torch.float64, device=device)
-    ).tolist()
+    sums = [float(weights.sum()), loss.item(), float(hits), float(len(batch))]
+    wall_s, cpu_s, wait_s = clock.lap()
     if not math.isfinite(sums[1]):
-        _refuse("loss", training, batch, ~torch.isfinite(losses))
-    # The mean over ranks of these is the gradient of the weighted mean over all of their samples.
-    (loss * (ranks.world / sums[0])).backward()
+        _refuse("loss", at, batch, ~torch.isfinite(losses))
+    (loss * (1 / sums[0])).backward()
     norm = torch.nn.utils.clip_grad_norm_(training.model.parameters(), options.clip_norm)
     if not math.isfinite(float(norm)):
-        _refuse("gradient", training, batch, torch.ones_like(losses, dtype=torch.bool))
+        _refuse("gradient", at, batch, torch.ones_like(losses, dtype=torch.bool))
     steps = options.epochs * training.train.batches_per_epoch
     rate = rate_at(at.step, steps, options.lr, options.warmup)
     set_rate(training.optimiser, rate)
@@ -137,16 +130,14 @@ def _step(
     training.optimiser.zero_grad(set_to_none=True)
     at.batch, at.step = at.batch + 1, at.step + 1
     at.sums = [a + b for a, b in zip(at.sums, sums, strict=True)]
-    _add_cost(at, wall_s / ranks.world, cpu_s, wait_s / ranks.world)
-    loss_now = sums[1] / sums[0]
-    times = (wait_s / ranks.world, wall_s / ranks.world)
-    return TrainingStep(at.step, steps, at.epoch + 1, loss_now, rate, round(sums[3]), *times), stop > 0
+    _add_cost(at, wall_s, cpu_s, wait_s)
+    return TrainingStep(at.step, steps, at.epoch + 1, sums[1] / sums[0], rate, len(batch), wait_s, wall_s)
 
 
 def _end_epoch(training: Training, clock: _Clock) -> dict[str, Any]:
     """Validate, keep the best weights, and decide whether to continue. Returns the row for callbacks."""
     at, options = training.position, training.options
-    measured = validate(training.model, training.val.epoch(0), training.class_weights, training.ranks)
+    measured = validate(training.model, training.val.epoch(0), training.class_weights)
     weight, loss, hits, samples = at.sums
     record: EpochRecord = {
         "epoch": at.epoch + 1,
@@ -164,23 +155,19 @@ def _end_epoch(training: Training, clock: _Clock) -> dict[str, Any]:
     worse_for = at.epoch - (at.best_epoch or 0)
     at.finished = at.epoch >= options.epochs or worse_for >= options.patience
     wall_s, cpu_s, _ = clock.lap()
-    spent = torch.tensor([wall_s, cpu_s], dtype=torch.float64, device=training.model.device)
-    wall_s, cpu_s = training.ranks.total(spent).tolist()
-    _add_cost(at, wall_s / training.ranks.world, cpu_s, 0.0)
+    _add_cost(at, wall_s, cpu_s, 0.0)
     return {**record, "best": best}
 
 
-def _refuse(quantity: str, training: Training, batch: Batch[Array], bad: Tensor) -> NoReturn:
-    """Raise InputError that names the samples of all ranks, the same on each rank."""
-    rows = bad.cpu().numpy()
-    ids = [bytes(i).hex() for part in training.ranks.gather(batch.sample_id[rows]) for i in part]
-    at = training.position
+def _refuse(quantity: str, at: Position, batch: Batch[Array], bad: Tensor) -> NoReturn:
+    """Raise InputError that names the samples."""
+    ids = [bytes(i).hex() for i in batch.sample_id[bad.cpu().numpy()]]
     named = ", ".join(ids[:_IDS_NAMED]) + (", ..." if len(ids) > _IDS_NAMED else "")
     raise InputError(
         f"training, epoch {at.epoch + 1}, batch {at.batch + 1}",
         quantity,
         f"is not finite for {len(ids)} samples: {named}",
-        "Nothing was overwritten. Check one with `datagen replay`, or give a smaller --lr and a new --out",
+        "Nothing was overwritten. Check them with `datagen verify`, or give a smaller --lr and a new --out",
     )
 
 

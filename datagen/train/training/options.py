@@ -38,33 +38,23 @@ class Options:
     model: str
     model_config: Mapping[str, Any]
     epochs: int
-    batch_scenes: int = 16
     house_share: float = 1.0  # of the houses that could be trained on; a larger share includes a smaller
-    candidates_per_robot: int | None = None  # sampled per robot per epoch; None for all
     lr: float = 2e-3  # the highest of the schedule
+    seed: int = 0
+    augment: Mapping[str, Any] = field(default_factory=dict)  # fields of Augmentation
+    batch_scenes: int = 16
     weight_decay: float = 0.0  # on matrices alone: not on biases and norms
     warmup: float = 0.05  # share of the steps in which the rate rises from 0
     clip_norm: float = 1.0  # of all gradients together
-    seed: int = 0
     patience: int = 8  # epochs without a lower validation loss
-    augment: Mapping[str, Any] = field(default_factory=dict)  # fields of Augmentation
 
-    def refuse_bad(self) -> None:
+    def __post_init__(self) -> None:
         """Raise InputError for values out of range, by the option's name."""
-        least = "Give {} or more"
         rules = {
-            "epochs": (self.epochs, self.epochs >= 1, least.format(1)),
-            "batch-scenes": (self.batch_scenes, self.batch_scenes >= 1, least.format(1)),
-            "seed": (self.seed, self.seed >= 0, least.format(0)),
-            "patience": (self.patience, self.patience >= 1, least.format(1)),
-            "candidates-per-robot": (
-                self.candidates_per_robot,
-                self.candidates_per_robot is None or self.candidates_per_robot >= 1,
-                least.format(1),
-            ),
+            "epochs": (self.epochs, self.epochs >= 1, "Give 1 or more"),
+            "seed": (self.seed, self.seed >= 0, "Give 0 or more"),
             "house-share": (self.house_share, 0 < self.house_share <= 1, "Give a share above 0, at most 1"),
             "lr": (self.lr, 0 < self.lr <= 1000, "Give a positive number, below 1000"),
-            "weight-decay": (self.weight_decay, 0 <= self.weight_decay <= 1000, "Give 0 to 1000"),
         }
         for name, (value, valid, fix) in rules.items():
             if not valid:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable
-from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from datagen.train.models.shared import SharedModel
 from datagen.train.rates import rate_fields
 from datagen.train.run_parts import open_parts
 from datagen.train.splits import HouseShare, refuse_one_class, refuse_shared_houses, split_by_house
-from datagen.train.training.callbacks import TensorBoardCallback, TrainingCallback, TrainingProgress
 from datagen.train.training.checkpoints import (
     Checkpoint,
     CheckpointHead,
@@ -34,10 +32,10 @@ from datagen.train.training.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from datagen.train.training.launching import Ranks
 from datagen.train.training.loop import Position, Training, run_training
 from datagen.train.training.optimiser import make_optimiser, optimiser_tensors, put_optimiser_tensors
 from datagen.train.training.options import STAGES, Options
+from datagen.train.training.training_progress import TrainingProgress
 
 _POSITION = ("step", "epoch", "best_epoch", "finished")  # fields of both Position and CheckpointHead
 
@@ -55,49 +53,45 @@ class TrainingJob:
     device: str = "cpu"
     threads: int = 1
     save_every_s: float = 300.0
-    tensorboard: str | None = None
     json_lines: bool = False  # for progress
     allow_incomplete: bool = False  # runs that lack samples of their plan
-    allow_mixed_labels: bool = False  # labels of one source in different versions
     encoded: str | None = None  # folder of `encode_runs`, which encodes clouds once
 
 
-def train_job(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
-    """Train in this process, one of `ranks`, from the position of `job.out`. Whether it finished."""
+def choose_device(device: str) -> str:
+    """`cpu`, or `cuda` where it is asked for or torch finds a GPU. InputError without one."""
+    has_gpu = device != "cpu" and torch.cuda.is_available()
+    if device == "cuda" and not has_gpu:
+        raise InputError("datagen train", "--device", "torch finds no GPU", "Give --device cpu")
+    return "cuda" if has_gpu else "cpu"
+
+
+def train_job(job: TrainingJob, stopping: Callable[[], bool]) -> bool:
+    """Train from the position of `job.out`. Whether it finished."""
     torch.set_num_threads(job.threads)
-    with ExitStack() as stack:
-        callbacks: list[TrainingCallback] = []
-        shown: Progress | None = None
-        if ranks.leads:
-            stack.enter_context(only_writer(job.out))
-            shown = stack.enter_context(Progress(job.json_lines))
-            shown.phase("opening runs")
-            callbacks.append(TrainingProgress(shown, job.out))
-        training, head = prepare_training(job, ranks, shown.counter("scenes encoded") if shown else None)
-        at = training.position
-        if ranks.leads and job.tensorboard and not at.finished:
-            callbacks.append(stack.enter_context(closing(TensorBoardCallback(job.tensorboard, at.step))))
+    with only_writer(job.out), Progress(job.json_lines) as shown:
+        shown.phase("opening runs")
+        training, head = prepare_training(job, shown.counter("scenes encoded"))
+        callbacks = [TrainingProgress(shown, job.out)]
         return run_training(
             training, lambda: save_checkpoint(job.out, training, head), callbacks, stopping, job.save_every_s
         )
 
 
-def prepare_training(
-    job: TrainingJob, ranks: Ranks, seen: Seen | None = None
-) -> tuple[Training, CheckpointHead]:
+def prepare_training(job: TrainingJob, seen: Seen | None = None) -> tuple[Training, CheckpointHead]:
     """The training at the position of `job.out`, or at its beginning, and the head of its checkpoint.
 
     `seen(done, of)` is called while scenes are encoded.
     """
     options, stage = job.options, STAGES[job.options.stage]
     began = read_checkpoint(job.init) if job.init is not None else None
-    train, val = _streams(job, ranks)
+    train, val = _streams(job)
     refuse_one_class(train)
     if began is not None:
         _refuse_known_houses(job, began.head, val)
     class_weights = _class_weights(train, stage.weighted)
     model = _model(job, began)
-    batches = (train, val) if job.encoded is None else _encoded(job, ranks, model, (train, val), seen)
+    batches = (train, val) if job.encoded is None else _encoded(job, model, (train, val), seen)
     optimiser = make_optimiser(model, options.lr, options.weight_decay)
     head = _head(job, model, train, val, began.head if began else None)
     position = Position()
@@ -106,13 +100,11 @@ def prepare_training(
         refuse_other_training(job.out, stored.head, head)
         position = _resume_position(job.out, stored, model, optimiser)
     weights = class_weights.to(model.device)
-    return Training(options, model, optimiser, *batches, weights, position, ranks), head
+    return Training(options, model, optimiser, *batches, weights, position), head
 
 
 def save_checkpoint(path: str, training: Training, head: CheckpointHead) -> None:
-    """Write the checkpoint, if this rank leads."""
-    if not training.ranks.leads:
-        return
+    """Write the checkpoint of a training at its position."""
     at, last = training.position, training.model.state_dict()
     resume = {f"model.{k}": v for k, v in last.items()}
     resume |= {f"optimiser.{k}": v for k, v in optimiser_tensors(training.optimiser).items()}
@@ -149,56 +141,44 @@ def _resume_position(
     )
 
 
-def _streams(job: TrainingJob, ranks: Ranks) -> tuple[SampleStream, SampleStream]:
+def _streams(job: TrainingJob) -> tuple[SampleStream, SampleStream]:
     options = job.options
-    if options.batch_scenes % ranks.world:
-        problem = f"{options.batch_scenes} scenes cannot be divided evenly among {ranks.world} processes"
-        raise InputError("datagen train", "--batch-scenes", problem, f"Give a multiple of {ranks.world}")
-    sizes: dict[str, Any] = {"scenes_per_batch": options.batch_scenes // ranks.world, "seed": options.seed}
-    sizes["allow_incomplete"] = job.allow_incomplete
-    drawn: dict[str, Any] = {"candidates_per_robot": options.candidates_per_robot, "augment": job.augment}
-    sizes["extra"] = _rate_fields(job, job.runs)
+    common: dict[str, Any] = {
+        "scenes_per_batch": options.batch_scenes,
+        "seed": options.seed,
+        "allow_incomplete": job.allow_incomplete,
+        "extra": _rate_fields(job, job.runs),
+    }
     if job.val_runs:
-        train = SampleStream(job.runs, **sizes, **drawn, houses=HouseShare(options.house_share))
-        sizes["extra"] = _rate_fields(job, job.val_runs)
-        val = SampleStream(job.val_runs, **sizes, shuffle=False)
+        share = HouseShare(options.house_share)
+        train = SampleStream(job.runs, **common, augment=job.augment, houses=share)
+        common["extra"] = _rate_fields(job, job.val_runs)
+        val = SampleStream(job.val_runs, **common, shuffle=False)
     else:
-        train, val = split_by_house(job.runs, options.house_share, **sizes, **drawn)
+        train, val = split_by_house(job.runs, options.house_share, **common, augment=job.augment)
     for stream in (train, val):
         _refuse_other_labels(options.stage, stream)
-    if not job.allow_mixed_labels:
-        parts = [summary.part for stream in (train, val) for summary in stream.parts]
-        refuse_mixed_labels([(part.place, spec) for part in parts for spec in part.specs])
+    parts = [summary.part for stream in (train, val) for summary in stream.parts]
+    refuse_mixed_labels([(part.place, spec) for part in parts for spec in part.specs])
     refuse_shared_houses(train, val)
-    train.use_rank(ranks.rank, ranks.world)
-    # With fewer scenes than processes, each process scores all; `validate` counts a sample once.
-    if val.n_scenes >= ranks.world:
-        val.use_rank(ranks.rank, ranks.world)
     return train, val
 
 
 def _encoded(
-    job: TrainingJob,
-    ranks: Ranks,
-    model: Model,
-    streams: tuple[SampleStream, SampleStream],
-    seen: Seen | None,
+    job: TrainingJob, model: Model, streams: tuple[SampleStream, SampleStream], seen: Seen | None
 ) -> tuple[EncodedBatches, EncodedBatches]:
     """Batches of the streams' scenes from clouds that are encoded once. InputError if options exclude it."""
     options, folder = job.options, Path(job.encoded or "")
-    if not isinstance(model, SharedModel):
-        problem = f"does not go with --model {model.name}: only clouds of `shared` are encoded apart from it"
-        raise InputError("datagen train", "--encoded", problem, "Omit one of them")
-    changing = {
+    excluded = {
+        f"--model {model.name}": not isinstance(model, SharedModel),
         "--augment": job.augment is not None,
-        "--candidates-per-robot": options.candidates_per_robot is not None,
-        "--processes": ranks.world > 1,
         "runs of disturbed trials": bool(_rate_fields(job, job.runs)),
     }
-    for name, is_given in changing.items():
+    for name, is_given in excluded.items():
         if is_given:
-            problem = f"does not go with {name}: all candidates are encoded once, with one label each"
+            problem = f"does not go with {name}: candidates of `shared` are encoded once, with one label each"
             raise InputError("datagen train", "--encoded", problem, "Omit one of them")
+    assert isinstance(model, SharedModel)
     made: list[EncodedBatches] = []
     given = (job.runs, options.seed), (job.val_runs or job.runs, None)
     for stream, (runs, seed) in zip(streams, given, strict=True):

@@ -16,7 +16,6 @@ from datagen.train.inputs import F64, Array, Batch
 from datagen.train.models import Model
 from datagen.train.rates import label_losses, success_shares
 from datagen.train.tensors import to_torch
-from datagen.train.training.launching import Ranks
 
 # Candidates for the best temperature; 1 is among them.
 _TEMPERATURES = 1.02 ** np.arange(-35, 71)
@@ -29,20 +28,16 @@ class ValidationMetrics(TypedDict):
     val_accuracy: float
     val_balanced_accuracy: float | None
     val_auc: float | None
-    val_temperature: NotRequired[float]  # absent in older checkpoints
+    val_temperature: NotRequired[float]  # absent in the history of the released model
 
 
-def validate(
-    model: Model, batches: Iterable[Batch[Array]], class_weights: Tensor, ranks: Ranks
-) -> ValidationMetrics:
-    """Loss, accuracy, balanced accuracy and AUC over all ranks; None where undefined.
+def validate(model: Model, batches: Iterable[Batch[Array]], class_weights: Tensor) -> ValidationMetrics:
+    """Loss, accuracy, balanced accuracy and AUC; None where undefined.
 
     The temperature is the divisor of the logits, from 0.5 to 4, with the least loss (Guo et al. 2017,
     arXiv 1706.04599).
     """
-    ranks.share_buffers(model)
     model.eval()
-    ids: list[Array] = []
     columns: list[Array] = []
     with torch.inference_mode():
         for batch in batches:
@@ -52,13 +47,9 @@ def validate(
             loss = label_losses(logits, given)
             share, log_odds = success_shares(given, logits.dtype), logits[:, 1] - logits[:, 0]
             rows = torch.stack([given.label.double(), log_p[:, 1].exp(), loss, share, log_odds], dim=1)
-            ids.append(batch.sample_id)
             columns.append(rows.cpu().numpy())
     model.train()
-    gathered = ranks.gather((np.concatenate(ids), np.concatenate(columns)))
-    # Several ranks may have scored the same sample.
-    _, first = np.unique(np.concatenate([i for i, _ in gathered]), axis=0, return_index=True)
-    label, p, loss, share, log_odds = np.concatenate([c for _, c in gathered])[np.sort(first)].T
+    label, p, loss, share, log_odds = np.concatenate(columns).T
     weight = class_weights.cpu().double().numpy()[label.astype(np.int64)]
     mean_loss = float(np.average(loss, weights=weight))
     if not np.isfinite(mean_loss):

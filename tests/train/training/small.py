@@ -8,10 +8,9 @@ from typing import Any
 
 from torch import Tensor
 
-from datagen.train.training.callbacks import TrainingStep
-from datagen.train.training.launching import Ranks
 from datagen.train.training.loop import run_training
 from datagen.train.training.options import Options
+from datagen.train.training.training_progress import TrainingStep
 from datagen.train.training.training_setup import TrainingJob, prepare_training, save_checkpoint
 
 TINY: dict[str, Any] = {
@@ -57,7 +56,7 @@ class Recorder:
 
 def train_until(job: TrainingJob, step: int | None = None) -> tuple[bool, Recorder]:
     """Resume a job until it ends or Ctrl-C comes during the given step."""
-    training, head = prepare_training(job, Ranks())
+    training, head = prepare_training(job)
     seen = Recorder()
 
     def stopping() -> bool:

@@ -33,12 +33,11 @@ from datagen.train.training.checkpoints import (
     write_checkpoint,
 )
 from tests.train.prediction.checkpoints import document_of, signed, stored_with
-from tests.train.training.changed_checkpoints import is_refused_or_equal_with_a_byte_changed
 from tests.train.training.small import TINY, equal
 
 ORIGIN: DataOrigin = {
     "spec_hashes": ["b"], "schema": "sim", "schema_version": 2, "n_samples": 3, "n_scenes": 1,
-    "samples_sha256": "a", "cost": {"cpu_s": 0.1},
+    "samples_sha256": "a", "cost": {"cpu_s": 0.1}, "robots": {"arm_reach_m": [0.3, 1.0]},
 }  # fmt: skip
 EPOCH: EpochRecord = {
     "epoch": 1, "step": 2, "loss": 0.4, "accuracy": 0.5,
@@ -113,7 +112,17 @@ def test_a_truncated_file_gives_one_line(written: Path, tmp_path: Path):
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_a_changed_byte_is_detected_or_changes_nothing(written: Path, data: st.DataObject):
-    is_refused_or_equal_with_a_byte_changed(written, written.with_name("changed.ckpt"), data)
+    whole, path = read_checkpoint(written), written.with_name("changed.ckpt")
+    stored = bytearray(written.read_bytes())
+    stored[data.draw(st.integers(0, len(stored) - 1))] ^= data.draw(st.integers(1, 255))
+    path.write_bytes(bytes(stored))
+    try:
+        back = read_checkpoint(path)
+    except InputError:
+        return
+    assert back.head == whole.head
+    assert equal(back.weights, whole.weights)
+    assert equal(back.resume, whole.resume)
 
 
 def with_header(path: Path, source: Path, changed: Callable[[dict[str, Any]], None]) -> Path:
@@ -179,7 +188,7 @@ def test_files_that_are_no_checkpoints_are_named(tmp_path: Path):
         (listed, "not a datagen checkpoint"),
         (foreign, "not a datagen checkpoint"),
         (zeros, "not a datagen checkpoint"),
-        (newer, "format_version: is 3, but this program reads 1 and 2. Use the version"),
+        (newer, "format_version: is 3, but this program reads 2. Use the version"),
         (tmp_path, "not a file"),
         (fifo, "not a file"),
         (tmp_path / "none", "No such file"),

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import io
 import json
-import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
 
 from datagen.display.progress import Progress
-from datagen.schemas.errors import InputError
-from datagen.train.training.callbacks import TensorBoardCallback, TrainingProgress, TrainingStep
+from datagen.train.training.training_progress import TrainingProgress, TrainingStep
 from tests.cluster.simulated import FakeClock
 
 RECORD: dict[str, Any] = {
@@ -65,9 +62,3 @@ def test_lines_are_json_also_on_a_terminal():
     assert (first["event"], first["step"], first["steps"], first["left_s"]) == ("progress", 31, 100, 138)
     assert (first["samples_per_s"], first["loader_share"]) == (30.0, 0.1)
     assert (second["event"], second["val_auc"], second["best"]) == ("epoch", None, True)
-
-
-def test_curves_need_their_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with pytest.raises(InputError, match="--tensorboard: the package tensorboard is not installed"):
-        TensorBoardCallback(str(tmp_path))

@@ -14,7 +14,6 @@ import torch
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array, Batch
 from datagen.train.training.checkpoints import load_model, read_checkpoint
-from datagen.train.training.launching import Ranks
 from datagen.train.training.loop import Batches, run_training
 from datagen.train.training.training_setup import prepare_training, save_checkpoint
 from tests.train.training.small import TINY_PAPER, Recorder, equal, job_of, train_until
@@ -45,7 +44,7 @@ def test_stopped_at_any_batch_training_ends_the_same(heuristic_run: Path, whole:
 
 def test_stopped_at_every_step_training_ends_the_same(heuristic_run: Path, tmp_path: Path):
     """With batch statistics and dropout, which both leave traces that a step must find again."""
-    config = {"model": "paper", "model_config": TINY_PAPER, "candidates_per_robot": 2}
+    config = {"model": "paper", "model_config": TINY_PAPER}
     whole = job_of(heuristic_run, tmp_path / "whole.ckpt", epochs=1, **config)
     assert train_until(whole)[0]
     halting = job_of(heuristic_run, tmp_path / "halting.ckpt", epochs=1, **config)
@@ -81,7 +80,7 @@ def test_the_best_epoch_is_kept_and_patience_ends_it(heuristic_run: Path, tmp_pa
 
 
 def test_classes_have_equal_weight_in_stage_1_alone(heuristic_run: Path, tmp_path: Path):
-    training, _ = prepare_training(job_of(heuristic_run, tmp_path / "c.ckpt"), Ranks())
+    training, _ = prepare_training(job_of(heuristic_run, tmp_path / "c.ckpt"))
     counts = np.array(training.train.class_counts())  # type: ignore[attr-defined]
     weights = training.class_weights.numpy()
     assert weights[0] * counts[0] == pytest.approx(weights[1] * counts[1])
@@ -111,7 +110,7 @@ def test_a_loss_that_is_not_finite_names_its_samples_and_keeps_the_weights(
     heuristic_run: Path, tmp_path: Path
 ):
     job = job_of(heuristic_run, tmp_path / "c.ckpt")
-    training, _ = prepare_training(job, Ranks())
+    training, _ = prepare_training(job)
     rows = [3, 5, 6, 20, 21]
     spoilt = Spoilt(training.train, 4, rows)
     kept: list[int] = []
@@ -128,7 +127,7 @@ def test_a_loss_that_is_not_finite_names_its_samples_and_keeps_the_weights(
 
 
 def test_a_gradient_that_is_not_finite_ends_training(heuristic_run: Path, tmp_path: Path):
-    training, _ = prepare_training(job_of(heuristic_run, tmp_path / "c.ckpt"), Ranks())
+    training, _ = prepare_training(job_of(heuristic_run, tmp_path / "c.ckpt"))
     first = next(iter(training.model.parameters()))
     first.register_hook(lambda gradient: gradient * float("nan"))
     before = {k: v.clone() for k, v in training.model.state_dict().items()}
@@ -142,7 +141,7 @@ def test_weights_that_overflow_do_not_replace_a_good_checkpoint(heuristic_run: P
     job = job_of(heuristic_run, tmp_path / "c.ckpt")
     assert train_until(job, 2)[0] is False
     before = Path(job.out).read_bytes()
-    training, head = prepare_training(job, Ranks())
+    training, head = prepare_training(job)
     weight = next(iter(training.model.parameters()))
     training.optimiser.register_step_post_hook(lambda *_: weight.data.fill_(float("inf")))
     with pytest.raises(InputError, match=r"has NaN or infinite numbers\. Nothing was overwritten"):

@@ -11,7 +11,6 @@ import pytest
 from datagen.schemas.errors import InputError
 from datagen.train.augment import Augmentation, Rotation
 from datagen.train.training.checkpoints import read_checkpoint
-from datagen.train.training.launching import Ranks
 from datagen.train.training.training_setup import prepare_training
 from tests.train.training.small import TINY_PAPER, equal, job_of, train_until
 
@@ -21,7 +20,7 @@ def test_inputs_are_made_once_and_an_interrupted_training_ends_as_a_whole_one(
 ):
     inputs, seen = tmp_path / "inputs", list[int]()
     jobs = [replace(job_of(heuristic_run, tmp_path / name), encoded=str(inputs)) for name in ("a", "b")]
-    prepare_training(jobs[0], Ranks(), lambda done, of: seen.append(done))
+    prepare_training(jobs[0], lambda done, of: seen.append(done))
     made = {path: path.stat().st_mtime_ns for path in inputs.rglob("*") if path.is_file()}
     assert seen and made
     assert train_until(jobs[0])[0]
@@ -37,7 +36,6 @@ def test_inputs_are_made_once_and_an_interrupted_training_ends_as_a_whole_one(
     ("told", "job", "options"),
     [
         ("--augment", {"augment": Augmentation(rotation=Rotation())}, {}),
-        ("--candidates-per-robot", {}, {"candidates_per_robot": 1}),
         ("--model", {}, {"model": "paper", "model_config": TINY_PAPER}),
     ],
 )
@@ -47,5 +45,5 @@ def test_what_does_not_go_with_it_is_refused(
     inputs = tmp_path / "inputs"
     asked = replace(job_of(heuristic_run, tmp_path / "model", **options), encoded=str(inputs), **job)
     with pytest.raises(InputError, match=told):
-        prepare_training(asked, Ranks())
+        prepare_training(asked)
     assert not inputs.exists()

@@ -12,7 +12,6 @@ from datagen.train.inputs import I64, Array, Batch, CandidateInputs, Clouds, Rob
 from datagen.train.models import Model
 from datagen.train.models.model import ModelConfig
 from datagen.train.training.checkpoints import read_checkpoint
-from datagen.train.training.launching import Ranks
 from datagen.train.training.validation import validate
 from tests.train.training.small import job_of, train_until
 
@@ -48,7 +47,7 @@ def test_the_temperature_makes_chances_true(too_sure: float):
     rng = np.random.default_rng(1)
     logits = rng.normal(0, 2, 40_000)
     label = (rng.random(len(logits)) < 1 / (1 + np.exp(-logits))).astype(np.int64)
-    found = validate(Told(too_sure * logits), [batch_of(label)], torch.ones(2), Ranks())
+    found = validate(Told(too_sure * logits), [batch_of(label)], torch.ones(2))
     assert found.get("val_temperature") == pytest.approx(too_sure, rel=0.05)
     exact = np.logaddexp(0, -(2 * label - 1) * too_sure * logits).mean()
     assert found["val_loss"] == pytest.approx(exact, rel=1e-5)

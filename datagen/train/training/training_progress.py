@@ -1,4 +1,4 @@
-"""Callbacks of the training loop: steps and epochs on the terminal, and as curves for TensorBoard."""
+"""Progress of the training loop: steps and epochs on the terminal."""
 
 from __future__ import annotations
 
@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from datagen.display.progress import Pace, Progress, clock_text, whole
-from datagen.schemas.errors import InputError
-from datagen.workers.extras import how_to_get
 
 
 @dataclass(frozen=True)
 class TrainingStep:
-    """One step of the optimiser, over all ranks."""
+    """One step of the optimiser."""
 
     step: int  # counted from 1
     steps: int  # in the whole schedule
@@ -72,33 +70,3 @@ class TrainingProgress:
         )
         values = {"epoch": step.epoch, "step": step.step, "steps": step.steps, "loss": round(step.loss, 5)}
         return text, {"out": self._place, **values, **speed, "left_s": whole(left_s)}
-
-
-class TensorBoardCallback:
-    """Curves for TensorBoard. A resumed training replaces those beyond `step`."""
-
-    def __init__(self, folder: str, step: int = 0) -> None:
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError:
-            fix = how_to_get("train")
-            raise InputError("--tensorboard", "", "the package tensorboard is not installed", fix) from None
-        self._writer = SummaryWriter(folder, purge_step=step + 1)
-        self._step = step
-
-    def step(self, step: TrainingStep) -> None:
-        self._step = step.step
-        for name, value in (("train/loss", step.loss), ("train/lr", step.lr)):
-            self._writer.add_scalar(name, value, step.step)
-        if step.step_s > 0:
-            self._writer.add_scalar("speed/samples_per_s", step.samples / step.step_s, step.step)
-            self._writer.add_scalar("speed/loader_share", step.wait_s / step.step_s, step.step)
-
-    def epoch(self, record: dict[str, Any]) -> None:
-        for name, value in record.items():
-            if name.startswith("val_") and value is not None:
-                self._writer.add_scalar(f"val/{name.removeprefix('val_')}", value, self._step)
-        self._writer.flush()
-
-    def close(self) -> None:
-        self._writer.close()
