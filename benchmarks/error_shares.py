@@ -39,7 +39,6 @@ from datagen.train.models import Model, build_model
 from datagen.train.models.hand_poses import HAND_WIDTH, N_MEASURES
 from datagen.train.models.shared import SharedModel
 from datagen.train.tensors import to_torch
-from datagen.train.training.launching import Ranks
 from datagen.train.training.loop import Position, Training, run_training
 from datagen.train.training.optimiser import make_optimiser
 from datagen.train.training.options import STAGES, Options
@@ -183,7 +182,7 @@ def _train(options: Options, train: EncodedBatches, val: EncodedBatches) -> Mode
     model = build_model(options.model, options.model_config)
     optimiser = make_optimiser(model, options.lr, options.weight_decay)
     position = Position()
-    training = Training(options, model, optimiser, train, val, torch.ones(2), position, Ranks())
+    training = Training(options, model, optimiser, train, val, torch.ones(2), position)
     run_training(training, lambda: None)
     model.load_state_dict(position.best_weights)
     return model.eval()

@@ -84,7 +84,7 @@ def test_labels_training_and_prediction_beside_a_users_files(installed: Path, fo
     plan = ("--split", "test", "--candidates", "in-range", "--config", "plan.toml")
     run(installed / "datagen", "submit", "plan", "--out", "plan", *plan, *small)  # on Ray
     heuristic = ("submit", "heuristic", "--workers", "0", "--config", "small.toml")
-    robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2", "--grid", "15")
+    robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2")
     write_frame(folder / "frame", draw_seen(0))
     commands = [
         (*heuristic, "--out", "run", "--split", "train", *small),

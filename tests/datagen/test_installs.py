@@ -156,7 +156,7 @@ def test_models_train_and_predict_without_simulators(wheel: Path, tmp_path: Path
         make_small_run(tmp_path / split, n, "--split", split)
     write_untrained(tmp_path / "model.ckpt", {})
     write_frame(tmp_path / "frame", draw_seen(0))
-    robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2", "--grid", "5")
+    robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2")
     given = ["--frame", "frame", *robot, "--out", "heat.png", "--html", "a.html"]
     helped, trained, predicted, reported = train.run(
         ["train", "--help"],

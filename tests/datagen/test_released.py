@@ -114,7 +114,7 @@ def test_a_frame_without_a_checkpoint_is_scored_by_the_released_model(
 ) -> None:
     u, v = released.DEMO_CLICK
     frame = ["--frame", str(released.sample_frame()), "--click", f"{u},{v}"]
-    robot = ["--base-height", "0.7", "--reach", "0.9", "--grid", "9"]
+    robot = ["--base-height", "0.7", "--reach", "0.9"]
     first = json_of(capsys, ["predict", *frame, *robot])
     assert first["scorer"].startswith("the released model, ")
     assert json_of(capsys, ["predict", "released", *frame, *robot]) == first

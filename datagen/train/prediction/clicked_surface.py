@@ -16,7 +16,7 @@ _FAR_SHARE, _LEAST_SECTORS = 0.8, 3
 _LEAST_FILLED = 0.5  # share of such a sector's ring that the plane fills
 _LEVEL, _UPRIGHT = 0.9, 0.3  # limits of the normal's z
 _ON_FLOOR_M = 0.04
-_FIX = "Click on the target itself, or give --mask"
+_FIX = "Click on the target itself, or give its mask"
 
 
 def refuse_surface(

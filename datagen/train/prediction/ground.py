@@ -28,7 +28,7 @@ _LEAST_SHARE, _MOST_BELOW = 0.008, 0.02
 _LEAST_POINTS = 300  # points needed for a residual
 _SURE_SHARE, _SURE_OFF_M = 0.03, 0.03
 _NEIGHBOURS, _TREE_POINTS = 20, 20_000  # for normals of clouds without a picture
-_FIX = "Give --gravity x,y,z (direction of gravity, camera frame) or --camera-pose pose.json"
+_FIX = "Give --gravity x,y,z (direction of gravity, camera frame) or the camera's pose"
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ def find_ground(frame: SensorFrame, camera_height_m: float | None, gravity: F64 
             raise InputError(frame.place, "camera height", problem, fix)
         return _with_residual(frame, T, "the pose given with the frame")
     if camera_height_m is None:
-        fix = "Give --camera-height in metres above the floor, or --camera-pose pose.json"
+        fix = "Give --camera-height in metres above the floor, or the camera's pose"
         raise InputError(frame.place, "camera height", "is missing", fix)
     if gravity is not None:
         down = gravity / np.linalg.norm(gravity)

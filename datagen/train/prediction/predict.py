@@ -245,12 +245,12 @@ def _with_target(
         if image is None:
             raise InputError("--click", "", "needs an image, not a cloud", "Give a frame with an image first")
         if image.mask is not None:
-            raise InputError("--click", "", "is given with a mask", "Give one of --click and --mask")
+            raise InputError("--click", "", "is given for a frame with a mask", "Omit --click, or the mask")
         grown = replace(image, mask=grow_mask(image, click, grounds[0].T_world_camera))
         clicked = image_frame(grown, first.T_world_camera, {"depth": first.place, "mask": "--click"})
         return [clicked, *frames[1:]]
     if not any(frame.on_target is not None for frame in frames):
-        fix = "Give --mask mask.png or --click u,v (of a .ply: a vertex property `target`, 1 on the target)"
+        fix = "Give --click u,v, or a mask (in a .ply: a vertex property `target`, 1 on the target)"
         raise InputError(first.place, "target", "is not marked", fix)
     return list(frames)
 

@@ -34,7 +34,7 @@ def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> 
     depth_m = image.depth_m
     if depth_m[v, u] == 0:
         near = (depth_m[max(v - 15, 0) : v + 16, max(u - 15, 0) : u + 16] > 0).any()
-        fix = "Give another pixel of the target" if near else "Take the frame again, or give --mask"
+        fix = "Give another pixel of the target" if near else "Take the frame again, or give its mask"
         raise InputError("--click", f"{u},{v}", "has no depth", fix)
     # Pixels outside the window are farther than `_GROWS_M` from the point.
     around_px = max(image.pinhole.fx_px, image.pinhole.fy_px) * _GROWS_M / max(depth_m[v, u] - _GROWS_M, 0.1)
@@ -74,7 +74,7 @@ def _grown(image: RgbdImage, click: tuple[int, int], T_world_camera: F64, pixel:
     if not stands_out:
         refuse_surface(grid, facets, depth_m, joined, click, pixel, _GROWS_M)
     if on_floor:
-        fix = "Click higher on the target, or give --mask"
+        fix = "Click higher on the target, or give its mask"
         raise InputError("--click", f"{pixel[0]},{pixel[1]}", "lies on the floor", fix)
     grown[v, u] = True
     # Rim pixels that `_breaks` left out are the target's where they are as near as the target next to them.
@@ -95,7 +95,7 @@ def _refuse_spread(grid: F64, mask: Bools, far_m: F64, pixel: tuple[int, int]) -
     if far > _FEW_FAR * len(points):
         problem = f"grows into its surroundings: a region {size}, {points[:, 2].mean():.2f} m above the floor"
         raise InputError(
-            "--click", f"{pixel[0]},{pixel[1]}", problem, "Click on another pixel, or give --mask"
+            "--click", f"{pixel[0]},{pixel[1]}", problem, "Click on another pixel, or give its mask"
         )
 
 
