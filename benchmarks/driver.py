@@ -13,12 +13,10 @@ from pathlib import Path
 
 from datagen.cluster.attempt_guard import Meter
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.job_totals import JobSummary
+from datagen.cluster.protocol import AttemptResult, JobSummary, StopRequest
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
-from datagen.cluster.retry_policy import RetryPolicy
-from datagen.cluster.stop_request import StopRequest
-from datagen.cluster.task import AttemptResult
+from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.run_records import Cost, LedgerEntry
 from tests.cluster.bad_cluster import Silent, simulate

@@ -29,10 +29,9 @@ from typing import Any
 import numpy as np
 import zarr
 
-from datagen.configuration.manifest import manifest_of
-from datagen.configuration.specify import layout_of, specify
-from datagen.jobs.job import JobPlan, JobRun, make_missing, open_recorder
-from datagen.jobs.options import JobOptions
+from datagen.configuration.specify import layout_of, manifest_of, specify
+from datagen.jobs.job import Job as LabelJob
+from datagen.jobs.job import JobOptions, JobRun
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
@@ -95,9 +94,9 @@ def run(
         )
         made = Run.create_or_open(open_storage(out), manifest, n)
         work = JobRun(made, absolute(options.houses), absolute(options.objects))
-        plan = JobPlan(made.storage, out, [work], JobOptions(workers=workers), time.monotonic(), (), ())
+        job = LabelJob(made.storage, out, [work], JobOptions(workers=workers), time.monotonic())
         started_s = time.perf_counter()
-        summary = make_missing(plan, open_recorder(plan))
+        summary = job.make_missing(job.record())
         ended_s = time.perf_counter()
         if summary.end != "complete":
             raise InputError(out, "", f"the job ended {summary.end}: {summary.cause}", "Fix that first")

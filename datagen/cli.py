@@ -1,8 +1,8 @@
 """The program `datagen`: its verbs, its one-line errors and its exit codes.
 
-Exit codes: 0 success, 1 finished with failures, findings or differences, 2 bad input, 3 the budget allows no
-further shard, 130 interrupted, 141 if the reader of the output closed it. A verb is imported when it is
-called, so that `datagen --help` does not wait for simulators.
+Exit codes: 0 success, 1 finished with failures, findings or differences, 2 bad input, 130 interrupted, 141 if
+the reader of the output closed it. A verb is imported when it is called, so that `--help` does not wait
+for simulators.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ from cyclopts.exceptions import (
 
 from datagen import __version__
 from datagen.cluster.environment import job_environment
-from datagen.console.beginning import began_with_process
-from datagen.console.command_lines import PRINTER, Interrupted
+from datagen.console.command_lines import PRINTER, Interrupted, begin_with_process
 from datagen.schemas.errors import InputError, one_line, refuse_not_utf8
 from datagen.workers.extras import missing_library
 
@@ -42,11 +41,9 @@ EXIT_GOOD, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 0, 2, 130, 141
 # a Python function, it returns its result, and `prints` names the function that prints it.
 VERBS: dict[str, tuple[str, str]] = {
     "submit": ("datagen.commands.submit:submit", "Make labels: start a run, or resume it."),
-    "resume": ("datagen.commands.resume:resume", "Make the missing labels of a run, or of merged runs."),
-    "extend": ("datagen.commands.extend:extend", "Raise the number of labels of a run and make them."),
+    "resume": ("datagen.commands.resume:resume", "Make the missing labels of a run; extend it."),
     "cancel": ("datagen.commands.cancel:cancel", "Ask the jobs of a run to stop and wait until they have."),
-    "logs": ("datagen.commands.logs:logs", "List what happened in a run, in order of time."),
-    "status": ("datagen.commands.status:status", "Show the progress and the failures of a run."),
+    "status": ("datagen.commands.status:status", "Show the progress, the failures and the events of a run."),
     "seal": ("datagen.commands.seal:seal", "Make one Zarr store of a run that any Zarr reader opens."),
     "unseal": ("datagen.commands.seal:unseal", "Remove that store; the run keeps every shard."),
     "merge": ("datagen.commands.merge:merge", "Merge runs into one."),
@@ -72,8 +69,8 @@ VERBS: dict[str, tuple[str, str]] = {
 }
 
 _HEADINGS = {
-    "Make labels": ("submit", "resume", "extend", "cancel", "merge", "relabel"),
-    "Look at runs": ("status", "logs", "show", "audit", "report"),
+    "Make labels": ("submit", "resume", "cancel", "merge", "relabel"),
+    "Look at runs": ("status", "show", "audit", "report"),
     "Check and keep runs": ("verify", "repair", "replay", "seal", "unseal", "gc"),
     "Models": ("train", "evaluate", "benchmark", "closed-loop", "predict", "calibrate"),
     "This machine": ("doctor", "assets"),
@@ -220,7 +217,8 @@ def main() -> None:
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:  # closed by the shell (`>&-`): no other file may get its descriptor
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
-    with job_environment(), began_with_process():
+    begin_with_process()
+    with job_environment():
         code = run(sys.argv[1:])
     sys.exit(code)
 

@@ -14,13 +14,11 @@ from datagen.cluster.attempt import ends_job
 from datagen.cluster.attempt_guard import Meter, this_host
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
-from datagen.cluster.job_progress import JobProgress
-from datagen.cluster.job_totals import JobSummary, empty_summary
-from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.job_monitor import JobProgress
+from datagen.cluster.protocol import AttemptResult, JobSummary, StopRequest, empty_summary, stop_on_signals
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
-from datagen.cluster.stop_request import StopRequest, stop_on_signals
-from datagen.cluster.task import AttemptResult
-from datagen.configuration.manifest import manifest_of
+from datagen.cluster.shard_policy import RetryPolicy
+from datagen.configuration.specify import manifest_of
 from datagen.configuration.stored_scenes import StoredScenes, specify_again
 from datagen.display.progress import Progress
 from datagen.schemas.cost import StageClock

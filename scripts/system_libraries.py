@@ -94,7 +94,7 @@ def main() -> int:
         print("install them with: " + install_command(packages_for(missing)), file=sys.stderr)
     else:
         print("install them with this system's package manager", file=sys.stderr)
-    print("until then no labels can be made here, except with --settler pybullet (an extra)", file=sys.stderr)
+    print("until then labels need the settler pybullet, an extra (settle.engine)", file=sys.stderr)
     return 0
 
 

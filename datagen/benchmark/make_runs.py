@@ -9,14 +9,11 @@ from pathlib import Path
 
 from datagen.assets.object_split import split_objects
 from datagen.benchmark.definition import BenchmarkRun
-from datagen.configuration.manifest import manifest_of
-from datagen.configuration.specify import layout_of
+from datagen.configuration.specify import layout_of, manifest_of
 from datagen.console.options import Sources
-from datagen.jobs.dry_run import PlannedRun, dry_run
-from datagen.jobs.job import JobRun
+from datagen.jobs.job import Job, JobOptions
 from datagen.jobs.job_report import JobResult
-from datagen.jobs.options import JobOptions, absolute_source, opening
-from datagen.jobs.start_job import open_job_run, planned_run, refuse_other_engines, start_job
+from datagen.jobs.start_job import absolute_source, open_job_run, refuse_other_engines
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import refuse_other
 from datagen.schemas.run import Run
@@ -55,40 +52,30 @@ def make_runs(
     runs: Mapping[str, BenchmarkRun],
     sources: BenchmarkSources,
     out: Path,
-    job_options: JobOptions,
+    options: JobOptions,
     words: list[str],
 ) -> Iterator[JobResult]:
     """Make each run in its folder of `out` and yield the result of its job; complete runs do not change.
 
     InputError, before the first job starts, if houses, objects or engines differ from the definition's: the
-    labels would differ too.
+    labels would differ too. `words` are those of the command, which also resumes.
     """
-    planned: list[PlannedRun] = []
-    with opening(words, job_options) as began_s:
+    manifests: dict[str, Manifest] = {}
+    with options.display() as shown:
+        shown.phase("opening houses and objects")
         for name, wanted in runs.items():
             objects = sources.objects[wanted.objects]
             refuse_other_engines(f"benchmark run {name}", wanted.spec)
             world = open_world(wanted.spec, sources.houses, objects)
             counts = {"n_houses": str(len(world.house_ids)), "n_objects": str(len(world.object_names))}
             references = {"houses": sources.houses, "objects": objects}
-            manifest = manifest_of(wanted.spec, layout_of(wanted.spec, wanted.n), references | counts)
-            planned.append(_planned(out / name, manifest, wanted.n, sources.houses, objects))
-    if job_options.dry_run:
-        yield dry_run(str(out), planned, job_options, began_s)
-        return
-    for name, each in zip(runs, planned, strict=True):
-        storage = open_storage(out / name)
-        run = Run.create_or_open(storage, each.manifest, each.n)
-        job_run = open_job_run(run, Sources(houses=each.houses, objects=each.objects), job_options.address)
-        yield start_job(
-            storage, str(out / name), [job_run], job_options, time.monotonic(), words, resume=words
-        )
-
-
-def _planned(folder: Path, manifest: Manifest, n: int, houses: str, objects: str) -> PlannedRun:
-    """The missing shards of the run in a folder, or of a new run. InputError for another run there."""
-    if not (folder / "manifest.json").is_file():
-        return PlannedRun(manifest, None, n, manifest.layout.shards_for(n), houses, objects)
-    run = Run.open(folder)
-    refuse_other(run.storage.url, run.manifest, manifest)
-    return planned_run(JobRun(run, houses, objects), n)
+            manifests[name] = manifest_of(wanted.spec, layout_of(wanted.spec, wanted.n), references | counts)
+            if (out / name / "manifest.json").is_file():
+                run = Run.open(out / name)
+                refuse_other(run.storage.url, run.manifest, manifests[name])
+    for name, wanted in runs.items():
+        run = Run.create_or_open(open_storage(out / name), manifests[name], wanted.n)
+        given = Sources(houses=sources.houses, objects=sources.objects[wanted.objects])
+        job_run = open_job_run(run, given, options.address)
+        job = Job(run.storage, str(out / name), [job_run], options, time.monotonic(), words, words)
+        yield job.run()

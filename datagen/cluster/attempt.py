@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from functools import lru_cache
 
 from datagen.cluster.attempt_guard import Meter, this_host
-from datagen.cluster.task import AttemptResult, JobCannotContinue, ShardTask
+from datagen.cluster.protocol import AttemptResult, JobCannotContinue, ShardTask
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import commit_key
 from datagen.schemas.record_files import utc_now

@@ -7,8 +7,6 @@
         check the commits of other drivers, after one superseded an attempt
         handle a stop request
 
-With a budget, an attempt begins only where it fits.
-
 Only the driver retries: executors never repeat an attempt by themselves.
 """
 
@@ -22,11 +20,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
-from datagen.cluster.budget import BudgetGuard
-from datagen.cluster.job_totals import End, JobSummary, JobTotals
-from datagen.cluster.open_shards import OpenShards
-from datagen.cluster.retry_policy import (
+from datagen.cluster.protocol import AttemptReport, End, Executor, JobSummary, JobTotals, StopRequest
+from datagen.cluster.shard_policy import (
     Durations,
+    OpenShards,
     RetryPolicy,
     ShardFailures,
     at_once,
@@ -38,8 +35,6 @@ from datagen.cluster.retry_policy import (
     too_many_quarantined,
     window,
 )
-from datagen.cluster.stop_request import StopRequest
-from datagen.cluster.task import AttemptReport, Executor
 from datagen.schemas.run_records import Commit, LedgerEntry, Outcome
 from datagen.schemas.shard_ranges import ShardRanges
 
@@ -86,7 +81,6 @@ class _Flight:
     check_s: float  # when to check it next
     alone: bool  # no other attempt was in flight at the same time
     begun: bool = False
-    working_s: float | None = None  # when it probably began: a worker was free, or an earlier attempt ended
     verdict: tuple[Outcome, str] | None = None  # set when the driver ended it
 
 
@@ -99,14 +93,13 @@ def drive(
     events: Events,
     stop: StopRequest,
     clock: Callable[[], float] = time.monotonic,
-    budget: BudgetGuard | None = None,
 ) -> JobSummary:
-    """Run every shard until it is committed or quarantined, or no further one fits the budget.
+    """Run every shard until it is committed or quarantined.
 
     `clock` is monotonic, in seconds. Raises InputError when records cannot be written; on any exception the
     attempts in flight are killed first.
     """
-    driver = _Driver(shards, make_task, executor, recorder, policy, events, stop, clock, budget)
+    driver = _Driver(shards, make_task, executor, recorder, policy, events, stop, clock)
     try:
         return driver.run()
     finally:
@@ -123,7 +116,6 @@ class _Driver(Generic[T]):
     _events: Events
     _stop: StopRequest
     _clock: Callable[[], float]
-    _budget: BudgetGuard | None
 
     def __post_init__(self) -> None:
         self._totals = JobTotals(len(self._shards))
@@ -170,23 +162,9 @@ class _Driver(Generic[T]):
 
     def _fill(self) -> None:
         room = at_once(self._lost_in_a_row, self._width()) - len(self._flights)
-        while room > 0 and self._fits() and (shard := self._next_shard()) is not None:
+        while room > 0 and (shard := self._next_shard()) is not None:
             self._submit(shard)
             room -= 1
-
-    def _fits(self) -> bool:
-        """Whether the budget allows one more attempt. If not, and nothing is in flight, the job ends."""
-        if self._budget is None or not (self._due or len(self._open)):
-            return True
-        began_s = [flight.working_s for flight in self._flights.values()]
-        if self._budget.allows(self._clock(), began_s, self._executor.slots):
-            return True
-        if not self._flights:
-            self._end, self._cause = (
-                "budget",
-                f"no further shard fits the budget of {self._budget.budget.text}",
-            )
-        return False
 
     def _next_shard(self) -> int | None:
         now_s = self._clock()
@@ -216,11 +194,7 @@ class _Driver(Generic[T]):
         check_s = now_s + order.deadline_s + self._policy.grace_s
         if len(self._flights) == 1:  # none of several is alone
             next(iter(self._flights.values())).alone = False
-        flight = _Flight(order, self._numbered, now_s, check_s, not self._flights)
-        self._flights[order.attempt] = flight
-        if self._budget is not None:
-            working = sum(other.working_s is not None for other in self._flights.values())
-            flight.working_s = now_s if working < self._executor.slots else None
+        self._flights[order.attempt] = _Flight(order, self._numbered, now_s, check_s, not self._flights)
         self._next_check_s = min(self._next_check_s, check_s)
         self._totals.retries += bool(trouble.attempts)
         self._executor.submit(self._make_task(order))
@@ -235,10 +209,6 @@ class _Driver(Generic[T]):
         flight = self._flights.pop(report.attempt, None)
         if flight is None:
             return  # handled before: a second report, or one after the driver gave up waiting
-        if flight.working_s is not None:  # its worker is free for the next
-            waiting = next((other for other in self._flights.values() if other.working_s is None), None)
-            if waiting is not None:
-                waiting.working_s = self._clock()
         if report.outcome == "cancelled" and flight.verdict is not None:
             outcome, cause = flight.verdict
             report = replace(report, outcome=outcome, cause=cause)
@@ -256,8 +226,6 @@ class _Driver(Generic[T]):
             self._lost_in_a_row = self._lost_in_a_row + 1 if report.outcome == "lost" else 0
         self._recorder.close(LedgerEntry.model_validate(report, from_attributes=True))
         self._totals.count(report)
-        if self._budget is not None:
-            self._budget.count(report)
         if report.outcome == "committed" and report.cost is not None:
             self._durations.add(report.cost.wall_s)
         if report.outcome == "superseded":

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from datagen.cluster.attempt_guard import Meter, guarded
-from datagen.cluster.task import AttemptReport, AttemptResult, Task
+from datagen.cluster.protocol import AttemptReport, AttemptResult, Task
 from datagen.schemas.record_files import utc_now
 
 T = TypeVar("T", bound=Task)

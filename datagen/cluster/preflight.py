@@ -5,13 +5,13 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from datagen.cluster.attempt import open_task
-from datagen.cluster.task import JobCannotContinue, ShardTask
+from datagen.cluster.protocol import JobCannotContinue, ShardTask
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
+from datagen.workers.extras import versions_of
 
 _PATIENCE_S = 120.0  # sources are opened, and their digests computed
 _SHARED = "Put the run and its sources on a path that every machine has, or on s3://"
@@ -62,14 +62,3 @@ def inspect_machine(task: ShardTask, probe: str, names: Iterable[str]) -> Machin
     except (JobCannotContinue, InputError) as error:
         return MachineReport(" ".join(str(error).split()), versions)
     return MachineReport("", versions)
-
-
-def versions_of(names: Iterable[str]) -> dict[str, str]:
-    """Installed versions of the names that are distributions; "" where not installed."""
-    found: dict[str, str] = {}
-    for name in names:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = ""
-    return found

@@ -13,11 +13,18 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
-from datagen.cluster.attempt_guard import Meter, guarded, resident_bytes
-from datagen.cluster.post_mortem import PostMortem, clear_notes, collect_post_mortem, failure_report
+from datagen.cluster.attempt_guard import (
+    Meter,
+    PostMortem,
+    clear_notes,
+    collect_post_mortem,
+    failure_report,
+    guarded,
+    resident_bytes,
+)
+from datagen.cluster.protocol import AttemptReport, AttemptResult, Task
 from datagen.cluster.ray_cluster import RaySettings, first_line, ray_cluster
 from datagen.cluster.ray_nodes import OtherNodes, Question, attempts_begun, end_attempts, post_mortems_of
-from datagen.cluster.task import AttemptReport, AttemptResult, Task
 from datagen.schemas.errors import InputError
 from datagen.schemas.run_records import Outcome
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from datagen.cluster.post_mortem import PostMortem, collect_post_mortem, read_note
+from datagen.cluster.attempt_guard import PostMortem, collect_post_mortem, read_note
 
 _SKIPPED_S = 30.0  # a machine that did not respond gets no request for this time
 _LOOK_S, _CONNECTS_WITHIN_S = 1.0, 2.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from datagen.cluster.retry_policy import ShardFailures
+from datagen.cluster.shard_policy import ShardFailures
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import commit_key
 from datagen.schemas.ledger import end_from_commit, lost_end

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Unpack
+from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 
-from datagen.console.command_lines import Interrupted, prints, words_of
+from datagen.console.command_lines import Interrupted, given_options, prints, words_of
 from datagen.console.options import (
     AsJson,
     File,
@@ -19,8 +19,9 @@ from datagen.console.options import (
     refuse_output,
 )
 from datagen.console.printing import print_json, print_rows
+from datagen.jobs.job import JobOptions
 from datagen.jobs.job_report import JobResult, print_job
-from datagen.jobs.options import JobKeywords, JobOptions, absolute_path, absolute_source
+from datagen.jobs.start_job import absolute_path, absolute_source
 from datagen.schemas.errors import InputError
 from datagen.schemas.whole_files import whole_file
 
@@ -28,7 +29,7 @@ app = App(name="benchmark", help="Make the runs of the frozen benchmark, and sco
 Names = Annotated[Sequence[str] | None, Parameter(name="--run", metavar="NAME")]
 
 
-def print_made(results: list[JobResult], *, job: Any = None, **_: Any) -> int:
+def print_made(results: list[JobResult], **_: Any) -> int:
     """Return the exit code; each job has printed its own summary."""
     return results[-1].exit_code
 
@@ -42,7 +43,7 @@ def make(
     out: PathOrAddress,
     run: Names = None,
     benchmark: File | None = None,
-    **job: Unpack[JobKeywords],
+    job: JobOptions = JobOptions(),  # noqa: B008 - immutable
 ) -> list[JobResult]:
     """Make the runs of the benchmark in OUT, and compare their digests with the frozen ones.
 
@@ -62,10 +63,9 @@ def make(
     from datagen.benchmark.frozen_runs import refuse_differing
     from datagen.benchmark.make_runs import divided_sources, make_runs
 
-    job_options = JobOptions(**job)
-    if job_options.detach:
+    if job.detach:
         raise InputError("--detach", "", "is for one run", "Run this command in the background instead")
-    job_options.refuse_bad()
+    job.refuse_bad()
     definition = read_benchmark(None if benchmark is None else Path(benchmark))
     runs = definition.chosen(run or ())
     folder = Path(absolute_path(out))
@@ -74,17 +74,17 @@ def make(
     for name in run or ():
         words += ["--run", name]
     words += words_of({"--benchmark": None if benchmark is None else str(Path(benchmark).absolute())})
-    words += job_options.words()
+    words += words_of(given_options(job))
     sources = divided_sources(houses, objects, folder, runs)
     results: list[JobResult] = []
     try:
-        for result in make_runs(runs, sources, folder, job_options, words):
+        for result in make_runs(runs, sources, folder, job, words):
             results.append(result)
-            print_job(result, job=job)
+            print_job(result)
             if not result.complete:
                 return results
     except Interrupted as stopped:
-        print_job(stopped.result, job=job)
+        print_job(stopped.result)
         raise Interrupted(str(stopped), [*results, stopped.result]) from stopped
     rows: list[tuple[str, str]] = []
     for name, wanted in runs.items():

@@ -90,7 +90,7 @@ def closed_loop(
     from datagen.closed_loop.loop_figure import draw_loop
     from datagen.closed_loop.loop_tables import print_loop
     from datagen.cluster.process_pool import work_through
-    from datagen.configuration.arms import refuse_missing_packages
+    from datagen.configuration.specify import refuse_missing_packages
     from datagen.evaluation_report.evaluated_runs import (
         open_evaluated_runs,
         refuse_seen_houses,

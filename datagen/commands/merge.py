@@ -12,7 +12,7 @@ from datagen.console.command_lines import command_line, prints, resumable, words
 from datagen.console.options import AsJson, PathOrAddress
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.display.progress import steps
-from datagen.jobs.options import absolute_path
+from datagen.jobs.start_job import absolute_path
 from datagen.reports.spending import account_for
 from datagen.schemas.lineage import lineage_summary
 from datagen.schemas.merged_runs import label_counts, open_runs

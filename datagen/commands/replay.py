@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from cyclopts import Parameter
 
-from datagen.configuration.arms import refuse_missing_packages
+from datagen.configuration.specify import refuse_missing_packages
 from datagen.console.options import AS_FOUND, AsJson, RunPath, Sources, Whole, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.display.progress import Step, steps

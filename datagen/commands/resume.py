@@ -1,44 +1,59 @@
-"""`datagen resume`: make the missing shards of a run, or of merged runs."""
+"""`datagen resume`: make the missing shards of a run, or of merged runs; with --n, extend it first."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from heapq import heapify, heapreplace
 from pathlib import Path
-from typing import Annotated, Unpack
+from typing import Annotated
 
-from datagen.console.command_lines import prints, words_of
-from datagen.console.options import AS_FOUND, RUN, Sources
+from datagen.configuration.stored_scenes import StoredScenes, refuse_too_few
+from datagen.console.command_lines import (
+    beginning_s,
+    given_options,
+    options_of,
+    prints,
+    resumable,
+    words_of,
+)
+from datagen.console.options import LABELLED, RUN, Sources, Whole, option
 from datagen.console.printing import counted
-from datagen.jobs.dry_run import PlannedRun
-from datagen.jobs.job import JobRun
+from datagen.jobs.detach import detach_job, in_ray_job
+from datagen.jobs.job import Job, JobOptions, JobRun, refuse_odd_n
 from datagen.jobs.job_report import JobResult, print_job
-from datagen.jobs.options import JobKeywords, JobOptions, absolute_path
-from datagen.jobs.start_job import continue_job, planned_run, source_words
+from datagen.jobs.start_job import absolute_path, open_job_run, with_absolute_paths, words_to_resume
+from datagen.schemas.errors import InputError
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lift_quarantine
+from datagen.schemas.run import Run
+from datagen.schemas.storage import open_storage
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResumeOptions(JobOptions, Sources):
+    """Options of `resume`."""
+
+    run: Annotated[str | Path, RUN] = field(kw_only=False)
+    n: Annotated[
+        Whole | None,
+        option("Labels wanted in total, to extend the run; not fewer than now. [default: as now]", LABELLED),
+    ] = None
+    quarantined: Annotated[
+        bool, option("Try quarantined shards again; their records are kept.", LABELLED)
+    ] = False
 
 
 @prints(print_job)
-def resume(
-    run: Annotated[str | Path, RUN],
-    /,
-    *,
-    quarantined: bool = False,
-    given: Sources = AS_FOUND,
-    **job: Unpack[JobKeywords],
-) -> JobResult:
+@options_of(ResumeOptions)
+def resume(options: ResumeOptions) -> JobResult:
     """Make the missing shards of a run and seal it. Committed shards are not made again.
 
-    The parts of merged runs are resumed one after the other.
+    The parts of merged runs are resumed one after the other. With --n, new labels are divided evenly among
+    the parts, in whole shards.
 
-    For example: datagen resume runs/first
-
-    Args:
-        run: Folder or s3:// address of a run or of merged runs.
-        quarantined: Try quarantined shards again; their records are kept.
-        given: New locations of houses, objects and the run with the scenes, where they have moved.
-        job: As for `submit`: `workers`, `address`, `max_quarantined`, `detach`, `dry_run`, `budget`,
-            `prices`, `json` and `quiet`.
+    For example: datagen resume runs/first --n 360,000
 
     Returns:
         The result of the job.
@@ -52,18 +67,65 @@ def resume(
         >>> result.complete, result.labels, result.remaining
         (True, 0, 0)
     """
-    run, job_options = str(run), JobOptions(**job)
-    job_options.refuse_bad()
-    words = ["resume", absolute_path(run), *words_of({"--quarantined": quarantined}), *source_words(given)]
-    words += job_options.words()
-
-    def lift(job_runs: Sequence[JobRun]) -> None:
-        if quarantined and not job_options.detach:
+    began_s, path = beginning_s(), str(options.run)
+    options.refuse_bad()
+    if options.n is not None:
+        refuse_odd_n(options.n)
+    options = with_absolute_paths(options)
+    words = ["resume", absolute_path(path), *words_of(given_options(options))]
+    if options.detach and options.address != "local":  # the run and its sources are paths on the cluster
+        words = ["resume", absolute_path(path), *words_of(given_options(in_ray_job(options)))]
+        return detach_job(words, path, options)
+    again = words_to_resume(path, options, options)
+    with resumable(again):
+        with options.display() as shown:
+            shown.phase("opening houses and objects")
+            storage = open_storage(path, create=False)
+            job_runs = [open_job_run(each, options, options.address) for each in open_runs(storage)]
+        if options.n is not None:
+            _extend(job_runs, options.n, path)
+        if options.quarantined:
             lifted = sum(len(lift_quarantine(job_run.run)) for job_run in job_runs)
-            if not job_options.quiet:
+            if not options.quiet:
                 sys.stderr.write(f"out of quarantine: {counted(lifted, 'shard')}\n")
+    if options.detach:
+        return detach_job(words_to_resume(path, in_ray_job(options), options), path, options)
+    return Job(storage, path, job_runs, options, began_s, words, again).run()
 
-    def planned(job_runs: Sequence[JobRun]) -> list[PlannedRun]:
-        return [planned_run(job_run, job_run.run.n, quarantined) for job_run in job_runs]
 
-    return continue_job(words, run, given, job_options, lift, planned)
+def _extend(job_runs: Sequence[JobRun], n: int, path: str) -> None:
+    """Raise the number of labels to n in total. InputError where it is smaller now, or scenes are lacking."""
+    runs = [job_run.run for job_run in job_runs]
+    have = [run.n for run in runs]
+    if n < sum(have):
+        problem = f"{path} already has {sum(have):,} planned, and a run never shrinks"
+        raise InputError("--n", str(n), problem, f"Give {sum(have)} or more")
+    wanted = shares(have, [run.layout.samples_per_shard for run in runs], n)
+    for job_run, more in zip(job_runs, wanted, strict=True):
+        if job_run.scenes_from:
+            stored = StoredScenes(Run.open(job_run.scenes_from), job_run.houses, job_run.objects)
+            refuse_too_few(stored, job_run.run.layout, more)
+    for run, more in zip(runs, wanted, strict=True):
+        run.grow(more)
+
+
+def shares(have: Sequence[int], per_shard: Sequence[int], n: int) -> list[int]:
+    """Grow `have` by whole shards until they sum to n: evenly, and the remainder to the last.
+
+    `per_shard` holds the labels of one shard of each run. Each new shard goes to the run with the fewest
+    new labels so far, the first of equals. A store is cut only at its end, so only the last run may
+    need a part of a shard.
+    """
+    # The common part is added at once: n may be a million shards away.
+    missing = n - sum(have)
+    step = missing // len(have) - max(per_shard)
+    given = [max(0, step // size) * size for size in per_shard]
+    missing -= sum(given)
+    heap = [(labels, k) for k, labels in enumerate(given)]
+    heapify(heap)
+    while missing >= per_shard[heap[0][1]]:
+        labels, k = heap[0]
+        missing, given[k] = missing - per_shard[k], labels + per_shard[k]
+        heapreplace(heap, (given[k], k))
+    given[-1] += missing
+    return [a + b for a, b in zip(have, given, strict=True)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from datagen.configuration.arms import refuse_missing_packages
+from datagen.configuration.specify import refuse_missing_packages
 from datagen.console.options import AS_FOUND, AssetSources, RunPath, Whole, refuse_output
 from datagen.console.printing import print_rows
 from datagen.drawing.arm_picture import draw_arm_picture

@@ -1,19 +1,28 @@
-"""`datagen status`: progress of a run, its jobs and its failures."""
+"""`datagen status`: progress of a run, its jobs and its failures; with --log, its events."""
 
 from __future__ import annotations
 
-from typing import Any
+import sys
+from typing import Annotated, Any
+
+from cyclopts import Parameter
 
 from datagen.console.command_lines import command_line
-from datagen.console.options import AsJson, RunPath
-from datagen.console.printing import counted, listed, print_json, print_rows
+from datagen.console.options import RunPath
+from datagen.console.printing import counted, listed, print_json, print_lines, print_rows
 from datagen.jobs.job_report import health_line, job_report
+from datagen.reports.events import events_of
 from datagen.reports.run_status import runs_report
+from datagen.schemas.errors import printable
 from datagen.schemas.jobs import Jobs
 from datagen.schemas.storage import Storage, open_storage
 
+_JSON = Parameter(help="Print one JSON document to standard output; with --log, one object a line.")
 
-def status(run: RunPath, /, *, stacks: bool = False, json: AsJson = False) -> int:
+
+def status(
+    run: RunPath, /, *, log: bool = False, stacks: bool = False, json: Annotated[bool, _JSON] = False
+) -> int:
     """Show the progress of a run: shards, labels, jobs, failed attempts by cause, and quarantine.
 
     For merged runs it shows the sums, and one line per part.
@@ -21,15 +30,35 @@ def status(run: RunPath, /, *, stacks: bool = False, json: AsJson = False) -> in
     For example: datagen status runs/first
 
     Args:
-        stacks: Add one stack for each cause of failure.
+        log: List what happened instead, in order of time: jobs, failed attempts, retries, quarantined shards.
+        stacks: Add the stack of each failure; without --log, one for each cause.
     """
     storage = open_storage(run, probe=False, create=False)
+    if log:
+        _print_log(storage, stacks, json)
+        return 0
     report = runs_report(storage, stacks)
     if json:
         print_json(report | {"jobs": [job_report(job) for job in Jobs(storage).all()]})
     else:
         _print(run, storage, report)
     return 0
+
+
+def _print_log(storage: Storage, stacks: bool, as_json: bool) -> None:
+    events = events_of(storage)
+    if not events:
+        sys.stderr.write("no events: no job has begun and no attempt has failed\n")
+    for event in events:
+        stack = event.stack if stacks else ""
+        if as_json:
+            fields = {"at": event.at, "event": event.what, "text": event.text}
+            fields |= {"shard": event.shard} if event.shard is not None else {}
+            print_json(fields | ({"stack": stack} if stack else {}), indent=None)
+        else:
+            at = event.at[:23].replace("T", " ") or "unknown time"
+            print_lines(printable(f"{at}  {event.text}"))
+            print_lines(stack, "    ")
 
 
 def _print(name: str, storage: Storage, report: dict[str, Any]) -> None:

@@ -2,42 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal, Unpack
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from datagen.configuration.arms import refuse_missing_packages
-from datagen.configuration.manifest import manifest_of
-from datagen.configuration.specify import layout_of, specify
+from datagen.configuration.specify import layout_of, manifest_of, refuse_missing_packages, specify
 from datagen.configuration.stored_scenes import (
     layout_again,
     open_stored_scenes,
     refuse_too_few,
     specify_again,
 )
-from datagen.console.command_lines import prints, words_of
-from datagen.console.options import File, PathOrAddress, Whole
+from datagen.console.command_lines import beginning_s, given_options, options_of, prints, words_of
+from datagen.console.options import LABELLED, ROBOT, RUNNING, Whole, option
 from datagen.display.progress import Progress
-from datagen.jobs.detach import detach_job
-from datagen.jobs.dry_run import PlannedRun, dry_run
-from datagen.jobs.job import JobRun
+from datagen.jobs.detach import detach_job, in_ray_job
+from datagen.jobs.job import Job, JobOptions, JobRun, refuse_odd_n
 from datagen.jobs.job_report import JobResult, print_job
-from datagen.jobs.options import (
-    JobKeywords,
-    JobOptions,
-    absolute_path,
+from datagen.jobs.start_job import (
     absolute_source,
-    opening,
-    refuse_odd_n,
+    refuse_unusable_engines,
+    with_absolute_paths,
+    words_to_resume,
 )
-from datagen.jobs.start_job import planned_run, refuse_unusable_engines, start_job
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED
 from datagen.schemas.record_files import refuse_other
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Layout, Manifest
+from datagen.schemas.run_records import Manifest
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import open_storage
 from datagen.workers.houses import open_houses
 from datagen.workers.labels import load_label_source
@@ -46,41 +42,87 @@ from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.world import World, assemble_world, open_world
 
 # Options that --scenes-from decides.
-_OF_SCENES = (
-    *("--seed", "--split", "--candidates", "--candidates-per-scene", "--robots-per-scene"),
-    *("--settler", "--renderer", "--noise"),
-)
-# A number is read as text: "grid" is not one.
-_TEXT = Parameter(converter=lambda kind, tokens: tokens[0].value, n_tokens=1, metavar="STR")
+_OF_SCENES = ("--seed", "--split", "--candidates", "--candidates-per-scene")
 _BUILTIN = (
     "Using built-in houses. For real ones: datagen assets fetch procthor-10k --out DIR, then "
     "--houses procthor:DIR/procthor"
 )
 
 
+def _text(text: str) -> Parameter:
+    """An option whose number is read as text: "grid" is not one."""
+    return Parameter(
+        converter=lambda kind, tokens: tokens[0].value, n_tokens=1, metavar="STR", help=text, group=LABELLED
+    )
+
+
+def _path(text: str) -> Parameter:
+    return Parameter(metavar="STR", help=text, group=LABELLED)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubmitOptions(JobOptions):
+    """Options of `submit`."""
+
+    label_source: Annotated[str, Parameter(name="LABEL_SOURCE", help="heuristic, plan or sim.")] = field(
+        kw_only=False
+    )
+    n: Annotated[Whole, option("Labels wanted; a larger number extends the run.", LABELLED)]
+    out: Annotated[str | Path, _path("Folder or s3:// address of the run.")]
+    houses: Annotated[
+        str | None, option("builtin, procthor:DIR or ai2thor:DIR. [default: builtin]", LABELLED)
+    ] = None
+    objects: Annotated[str | None, option("builtin or ycb:DIR. [default: builtin]", LABELLED)] = None
+    scenes_from: Annotated[
+        str | Path | None, _path("Run whose scenes and candidates are labelled again.")
+    ] = None
+    candidates: Annotated[
+        Literal["grid", "clear", "in-range"] | None,
+        option(
+            "Cells to sample from: all, those with a clear base, or those also within reach. [default: grid]",
+            LABELLED,
+        ),
+    ] = None
+    candidates_per_scene: Annotated[
+        int | str | None,
+        _text("Candidates sampled per scene from the 25x25 grid, or grid for all 625. [default: 60]"),
+    ] = None
+    split: Annotated[
+        Literal["train", "val", "test", "all"] | None,
+        option("Split of the houses; splits share no house. [default: all]", LABELLED),
+    ] = None
+    seed: Annotated[Whole | None, option("Seed of the whole run. [default: 0]", LABELLED)] = None
+    config: Annotated[
+        str | Path | None,
+        Parameter(
+            metavar="PATH", help="TOML file with any other field of the specification.", group=LABELLED
+        ),
+    ] = None
+    robot: Annotated[
+        str | None,
+        option(
+            "fetch, panda, panda-scaled or xarm7; sets reach and height. "
+            "[default: any for heuristic, panda-scaled for plan and sim]",
+            ROBOT,
+        ),
+    ] = None
+    perturb: Annotated[
+        Whole | None,
+        option(
+            "Arrivals per candidate, with random errors of pose; in sim also of the world. "
+            "[default: 1, without errors]",
+            ROBOT,
+        ),
+    ] = None
+    dry_run: Annotated[
+        bool,
+        option("Check everything, make nothing; print shards, scenes and the command.", RUNNING),
+    ] = False
+
+
 @prints(print_job)
-def submit(
-    label_source: Annotated[str, Parameter(name="LABEL_SOURCE")],
-    /,
-    *,
-    n: Whole,
-    out: PathOrAddress,
-    houses: str | None = None,
-    objects: str | None = None,
-    scenes_from: PathOrAddress | None = None,
-    robot: str | None = None,
-    perturb: Whole | None = None,
-    candidates: Literal["grid", "clear", "in-range"] | None = None,
-    candidates_per_scene: Annotated[int | str | None, _TEXT] = None,
-    robots_per_scene: Whole | None = None,
-    split: Literal["train", "val", "test", "all"] | None = None,
-    seed: Whole | None = None,
-    settler: str | None = None,
-    renderer: str | None = None,
-    noise: bool = False,
-    config: File | None = None,
-    **job: Unpack[JobKeywords],
-) -> JobResult:
+@options_of(SubmitOptions)
+def submit(options: SubmitOptions) -> JobResult:
     """Make labels: start a run, or resume the run in the folder.
 
     To train a model, make plan labels with --candidates in-range; to repeat the paper, heuristic labels; to
@@ -92,29 +134,8 @@ def submit(
 
     For example: datagen submit heuristic --n 1e5 --out runs/first
 
-    Args:
-        label_source: heuristic, plan or sim.
-        n: Labels wanted; a larger number extends the run.
-        out: Folder or s3:// address of the run.
-        houses: builtin, procthor:DIR or ai2thor:DIR [builtin].
-        objects: builtin or ycb:DIR [builtin].
-        scenes_from: Run whose scenes and candidates are labelled again.
-        robot: fetch, panda, panda-scaled or xarm7; sets reach and height [plan, sim: panda-scaled].
-        perturb: Arrivals per candidate, with random errors of pose; in sim also of the world [1, without].
-        candidates: Cells to sample from: all, those with a clear base, or those also within reach [grid].
-        candidates_per_scene: Candidates sampled per scene from the 25x25 grid, or grid for all 625 [60].
-        robots_per_scene: Robots that share a scene's candidates [4; 1 on a whole grid].
-        split: Split of the houses; splits share no house [all].
-        seed: Seed of the whole run [0].
-        settler: Physics engine: sapien or pybullet [sapien where installed].
-        renderer: Renderer: embree, sapien or pybullet [embree].
-        noise: Add sensor noise to the frame.
-        config: TOML file with any field of the specification.
-        job: `workers`, `address`, `max_quarantined`, `detach`, `dry_run`, `budget`, `prices`, `json`, and
-            `quiet` to report no progress.
-
     Returns:
-        The result of the job. The call blocks and reports progress on standard error.
+        The result of the job. The call blocks and reports progress on standard error, unless `quiet`.
 
     Raises:
         InputError: An option, a source or the run cannot be used.
@@ -127,100 +148,102 @@ def submit(
         >>> result.complete, result.labels, result.path == str(folder / "new")
         (True, 8, True)
     """
-    out, job_options = str(out), JobOptions(**job)
-    scenes_from = None if scenes_from is None else str(scenes_from)
-    config = None if config is None else Path(config)
+    began_s, path, label_source = beginning_s(), str(options.out), options.label_source
     refuse_missing_packages(label_source)
     load_label_source(label_source)  # InputError for an unknown one
-    refuse_odd_n(n)
-    job_options.refuse_bad()
-    given = {
-        "--n": n,
-        "--out": absolute_path(out),
-        "--houses": houses and absolute_source(houses),
-        "--objects": objects and absolute_source(objects),
-        "--scenes-from": scenes_from and absolute_path(scenes_from),
-        "--robot": robot,
-        "--perturb": perturb,
-        "--candidates": candidates,
-        "--candidates-per-scene": candidates_per_scene,
-        "--robots-per-scene": robots_per_scene,
-        "--split": split,
-        "--seed": seed,
-        "--settler": settler,
-        "--renderer": renderer,
-        "--noise": noise,
-        "--config": config and config.expanduser().absolute(),
-    }
-    words = ["submit", label_source, *words_of(given), *job_options.words()]
-    if job_options.detach and job_options.address != "local":
-        return detach_job(words, out, job_options)  # its sources are paths on the cluster
-    options = {
-        "seed": seed,
-        "split": split,
-        **_candidate_options(candidates, candidates_per_scene),
-        "candidates.robots_per_scene": robots_per_scene,
-        "settle.engine": settler,
-        "observation.renderer": renderer,
-        "observation.noise.enabled": True if noise else None,
-    }
-    with opening(words, job_options) as began_s:
-        if scenes_from is None:
-            houses, objects = houses or "builtin", objects or "builtin"
-            house_source, object_source = open_houses(houses), open_objects(objects)
-            spec = specify(label_source, house_source, object_source, options, config, robot, perturb)
-            world = assemble_world(spec, house_source, object_source, houses, objects)
-            refuse_unusable_engines(spec, job_options.address)
-            if _existing_layout(out) is None:
-                _refuse_no_scene(world, houses)
-            source_url, layout, schema_version = "", layout_of(spec, n), None
-        else:
-            of_scenes = {name: given[name] for name in _OF_SCENES}
-            stored = open_stored_scenes(scenes_from, houses, objects, of_scenes)
-            spec = specify_again(label_source, stored, config, robot, perturb)
-            houses, objects = stored.houses, stored.objects
-            world = open_world(spec, houses, objects)
-            refuse_unusable_engines(spec, job_options.address)
-            source_url, schema_version = stored.run.storage.url, stored.run.manifest.schema_version
-            layout = _existing_layout(out) or layout_again(spec, stored, n)
-            refuse_too_few(stored, layout, n)
-        sources = {"houses": absolute_source(houses), "objects": absolute_source(objects)}
-        sources |= {"n_houses": str(len(world.house_ids)), "n_objects": str(len(world.object_names))}
-        if source_url:
-            sources["scenes_from"] = source_url
-        manifest = manifest_of(spec, layout, sources, schema_version)
-        planned = _planned(out, manifest, n) if job_options.dry_run else None
-        run = None
-        if planned is None:
-            run = Run.create_or_open(open_storage(out), manifest, n)
-    if given["--houses"] is None and not source_url:
-        Progress(job_options.json).say("note", {"note": _BUILTIN}, _BUILTIN)
-    if planned is not None:
-        return dry_run(out, [planned], job_options, began_s)
-    assert run is not None
-    if job_options.detach:
-        return detach_job(words, out, job_options)
-    job_run = JobRun(run, sources["houses"], sources["objects"], source_url)
-    return start_job(
-        run.storage, out, [job_run], job_options, began_s, [*words, *job_options.address_words()]
-    )
-
-
-def _planned(out: str, manifest: Manifest, n: int) -> PlannedRun:
-    """The shards that the run at `out`, or a new one, lacks. InputError for another specification there."""
-    sources = manifest.sources
-    references = sources["houses"], sources["objects"], sources.get("scenes_from", "")
-    run = _existing_run(out)
+    refuse_odd_n(options.n)
+    if options.dry_run and options.detach:
+        raise InputError("--dry-run", "--detach", "makes nothing that could be detached", "Omit one of them")
+    options.refuse_bad()
+    options = with_absolute_paths(options)
+    words = ["submit", label_source, *words_of(given_options(replace(options, dry_run=False)))]
+    if options.detach and options.address != "local":  # its sources are paths on the cluster
+        words = ["submit", label_source, *words_of(given_options(in_ray_job(options)))]
+        return detach_job(words, path, options)
+    with options.display() as shown:
+        shown.phase("opening houses and objects")
+        run, manifest = _specified(options)
+    if options.houses is None and options.scenes_from is None and not options.quiet:
+        Progress(options.json).say("note", {"note": _BUILTIN}, _BUILTIN)
+    if options.dry_run:
+        return _dry_run(path, run, manifest, options.n, words)
     if run is None:
-        return PlannedRun(manifest, None, n, manifest.layout.shards_for(n), *references)
-    refuse_other(run.storage.url, run.manifest, manifest)
-    return planned_run(JobRun(run, *references), max(n, run.n))
+        run = Run.create_or_open(open_storage(path), manifest, options.n)
+    else:
+        run.grow(options.n)
+    if options.detach:
+        return detach_job(words_to_resume(path, in_ray_job(options)), path, options)
+    sources = manifest.sources
+    job_run = JobRun(run, sources["houses"], sources["objects"], sources.get("scenes_from", ""))
+    again = words_to_resume(path, options)
+    return Job(run.storage, path, [job_run], options, began_s, words, again).run()
 
 
-def _existing_layout(out: str) -> Layout | None:
-    """The layout of the run at `out`; None where there is none yet. InputError for merged runs."""
-    run = _existing_run(out)
-    return None if run is None else run.layout
+def _specified(options: SubmitOptions) -> tuple[Run | None, Manifest]:
+    """The run at `out`, None where there is none yet, and the manifest of the options.
+
+    InputError where they differ and, before anything is written, where no scene can be made.
+    """
+    run, label_source = _existing_run(str(options.out)), options.label_source
+    config = None if options.config is None else Path(options.config)
+    chosen = options.robot, options.perturb
+    if options.scenes_from is None:
+        houses, objects = options.houses or "builtin", options.objects or "builtin"
+        house_source, object_source = open_houses(houses), open_objects(objects)
+        fields = {"seed": options.seed, "split": options.split, **_candidate_fields(options)}
+        spec = specify(label_source, house_source, object_source, fields, config, *chosen)
+        world = assemble_world(spec, house_source, object_source, houses, objects)
+        refuse_unusable_engines(spec, options.address)
+        if run is None:
+            _refuse_no_scene(world, houses)
+        layout, schema_version, stored_in = layout_of(spec, options.n), None, {}
+    else:
+        given = given_options(options)
+        stored = open_stored_scenes(
+            str(options.scenes_from),
+            options.houses,
+            options.objects,
+            {name: given[name] for name in _OF_SCENES if name in given},
+        )
+        spec = specify_again(label_source, stored, config, *chosen)
+        houses, objects = stored.houses, stored.objects
+        world = open_world(spec, houses, objects)
+        refuse_unusable_engines(spec, options.address)
+        layout = layout_again(spec, stored, options.n) if run is None else run.layout
+        refuse_too_few(stored, layout, options.n)
+        schema_version = stored.run.manifest.schema_version
+        stored_in = {"scenes_from": stored.run.storage.url}
+    sources = {
+        "houses": absolute_source(houses),
+        "objects": absolute_source(objects),
+        "n_houses": str(len(world.house_ids)),
+        "n_objects": str(len(world.object_names)),
+    }
+    manifest = manifest_of(spec, layout, sources | stored_in, schema_version)
+    if run is not None:
+        refuse_other(run.storage.url, run.manifest, manifest)
+    return run, manifest
+
+
+def _dry_run(path: str, run: Run | None, manifest: Manifest, n: int, words: list[str]) -> JobResult:
+    """The shards and scenes that the run at `path` lacks, and the command that makes them."""
+    layout = manifest.layout if run is None else run.layout
+    missing = ShardRanges.of(range(layout.shards_for(n)))
+    if run is not None:
+        n = max(n, run.n)
+        decided = ShardRanges.of(run.committed() | run.quarantined())
+        missing = ShardRanges.of(range(layout.shards_for(n))).without(decided)
+    shards = len(missing)
+    return JobResult(
+        path=path,
+        end="dry-run",
+        n=n,
+        made_from=manifest.made_from,
+        shards=shards,
+        remaining=shards,
+        scenes=shards * layout.scenes_per_shard,
+        resume=tuple(words),
+    )
 
 
 def _existing_run(out: str) -> Run | None:
@@ -230,9 +253,13 @@ def _existing_run(out: str) -> Run | None:
     except InputError:
         return None  # nothing there, or an address that `open_storage` refuses
     if storage.exists(MERGED):
-        fix = "Extend it with `datagen extend`, or choose another --out"
+        fix = "Extend it with `datagen resume RUN --n N`, or choose another --out"
         raise InputError(out, "", "holds merged runs, each with its own specification", fix)
-    return Run.open(storage) if storage.exists("manifest.json") else None
+    if not storage.exists("manifest.json"):
+        return None
+    run = Run.open(storage)
+    _ = run.schema  # InputError for an unknown version
+    return run
 
 
 def _refuse_no_scene(world: World, houses: str) -> None:
@@ -243,24 +270,24 @@ def _refuse_no_scene(world: World, houses: str) -> None:
         raise InputError("--houses", houses, f"no scene can be made: {error.problem}", error.fix) from error
 
 
-def _candidate_options(kind: str | None, per_scene: int | str | None) -> dict[str, int | str | None]:
+def _candidate_fields(options: SubmitOptions) -> dict[str, Any]:
     """Fields of --candidates and --candidates-per-scene, by dotted name."""
-    number = _per_scene(None if per_scene is None else str(per_scene))
+    kind, number = options.candidates, _per_scene(options.candidates_per_scene)
     if kind == "grid":
         if number not in (None, "grid"):
             fix = "Give --candidates clear or in-range to sample some, or omit the number"
-            raise InputError("--candidates-per-scene", str(per_scene), "a grid has all its cells", fix)
+            raise InputError("--candidates-per-scene", str(number), "a grid has all its cells", fix)
         number = "grid"
     elif kind is not None and number == "grid":
         problem = f"a whole grid has cells that are not {kind}"
         raise InputError("--candidates", kind, problem, "Give --candidates-per-scene 60")
-    within = kind if kind != "grid" else None
-    return {"candidates.per_scene": number, "candidates.within": within}
+    return {"candidates.per_scene": number, "candidates.within": kind if kind != "grid" else None}
 
 
-def _per_scene(text: str | None) -> int | str | None:
-    if text is None or text == "grid":
-        return text
+def _per_scene(given: int | str | None) -> int | str | None:
+    text = str(given)
+    if given is None or text == "grid":
+        return given
     if not (text.isascii() and text.isdigit() and len(text) < 9) or not 1 <= int(text) <= 625:
         raise InputError(
             "--candidates-per-scene", text, "is neither grid nor a number from 1 to 625", "Give 60 or grid"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hi
 from cyclopts import Parameter
 from pydantic import TypeAdapter, ValidationError
 
-from datagen.configuration.specify import parse_toml, read_toml
+from datagen.configuration.toml_files import parse_toml, read_toml
 from datagen.console.command_lines import Interrupted, interruptible, options_of, print_interrupted, prints
 from datagen.console.options import AllowIncomplete, AsJson, File, PathOrAddress, PathsOrAddresses, Whole
 from datagen.console.printing import print_json, print_rows, seconds

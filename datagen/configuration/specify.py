@@ -1,41 +1,55 @@
-"""Make a specification and a layout from options and a TOML file."""
+"""Make a specification, a layout and a manifest from options and a TOML file."""
 
 from __future__ import annotations
 
-import tomllib
+import platform
 from collections.abc import Mapping
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from datagen.configuration.arms import (
-    ARM_PACKAGES,
-    arm_versions,
-    complete_arm,
-    narrow_candidates,
-    refuse_unsuited,
-    robot_of,
-)
+from datagen import __version__
+from datagen.configuration.toml_files import first_of, read_toml
 from datagen.schemas.errors import InputError, choices
-from datagen.schemas.run_records import Layout
-from datagen.schemas.specification import Source, Specification
-from datagen.schemas.untrusted_files import read_regular
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.record_files import utc_now
+from datagen.schemas.run_records import Layout, Manifest
+from datagen.schemas.specification import (
+    ArmParams,
+    CandidateParams,
+    DisturbanceParams,
+    Range,
+    Source,
+    Specification,
+)
+from datagen.workers.extras import how_to_get, versions_of
 from datagen.workers.houses.house import HouseSource
 from datagen.workers.labels import load_label_source
 from datagen.workers.objects.model import ObjectSource
 from datagen.workers.rendering import RENDERERS, load_renderer
-from datagen.workers.robots import robot_limits
+from datagen.workers.robots import ROBOTS, robot_limits
 from datagen.workers.scenes import scenes_version
 from datagen.workers.settling import SETTLERS, first_settler, load_settler
 
+Fields = dict[str, Any]
 Options = Mapping[str, Any]  # by dotted name in the specification; None where not given
 
-_MAX_CONFIG_BYTES = 1 << 20
-_MAX_DEPTH = 16
 # Distributions whose version can change bits of a sample, by the engine that needs them.
 _ENGINE_PACKAGES = {"sapien": "sapien", "pybullet": "pybullet", "embree": "embreex"}
+# Label sources that move an arm, and the distributions whose version can change bits of their labels.
+ARM_PACKAGES: dict[str, tuple[str, ...]] = {
+    "plan": ("coal", "mani_skill", "pin", "sapien"),
+    "sim": ("coal", "mani_skill", "pin", "sapien"),
+}
+# Sections of the arm that only some label sources have.
+_NOT_FOR: dict[str, tuple[str, ...]] = {"plan": ("trial",), "sim": ()}
+# Reaches are stated in whole millimetres.
+_STEP_M = 0.001
+# Step between sampled reaches: opening an arm of another reach costs as much as planning ten candidates.
+REACH_STEP_M = 0.01
+_LIBRARIES = ("numpy", "scipy", "embreex", "sapien", "pybullet", "zarr", "obstore", "ray", "trimesh")
 _SCENES_PER_SHARD = 32
 _SHARDS_AT_LEAST = 8
 
@@ -88,13 +102,12 @@ def specify(
         raise InputError(place, "candidates.within", problem, "Give --candidates-per-scene 60")
     if chosen is not None:
         refuse_unsuited(spec, chosen, place, "Correct the values, or choose another --robot")
-    for option, field, name, registry in (
-        ("--settler", "settle.engine", spec.settle.engine, SETTLERS),
-        ("--renderer", "observation.renderer", spec.observation.renderer, RENDERERS),
+    for field, name, registry in (
+        ("settle.engine", spec.settle.engine, SETTLERS),
+        ("observation.renderer", spec.observation.renderer, RENDERERS),
     ):
         if name not in registry:
-            given = option if options.get(field) == name else place
-            raise InputError(given, field, f"{name!r} is unknown", choices(registry, name))
+            raise InputError(place, field, f"{name!r} is unknown", choices(registry, name))
     load_settler(spec.settle.engine)
     load_renderer(spec.observation.renderer)
     return spec.model_copy(update={"engines": scene_engines(spec) | label_engines(spec.label_source)})
@@ -119,18 +132,6 @@ def validated(fields: dict[str, Any], place: str) -> Specification:
         raise first_of(error, place) from None
 
 
-def first_of(error: ValidationError, place: str, *section: str) -> InputError:
-    """The InputError for the first wrong field of a file, or of a section of it."""
-    first = error.errors()[0]
-    field = ".".join((*section, *map(str, first["loc"])))
-    fix = (
-        "Remove or correct the key: docs/reference/specification.md lists all"
-        if (first["type"] == "extra_forbidden")
-        else "Correct the value"
-    )
-    return InputError(place, field, f"{first['msg']} (given: {str(first['input'])[:80]})", fix)
-
-
 def layout_of(spec: Specification, n: int) -> Layout:
     """The layout: shards of about 32 scenes, or fewer in a small run, so that workers share it evenly.
 
@@ -140,6 +141,27 @@ def layout_of(spec: Specification, n: int) -> Layout:
     most = max(1, min(_SCENES_PER_SHARD, scenes // _SHARDS_AT_LEAST))
     even = next((k for k in range(most, most // 2, -1) if scenes % k == 0), most)
     return Layout(scenes_per_shard=even, candidates_per_scene=spec.candidates.count)
+
+
+def manifest_of(
+    spec: Specification, layout: Layout, sources: dict[str, str], schema_version: int | None = None
+) -> Manifest:
+    """The manifest of a new run; `schema_version` is that of the run whose scenes are labelled."""
+    source = load_label_source(spec.label_source)
+    newest = SCHEMAS[source.schema].version
+    return Manifest(
+        spec=spec,
+        spec_hash=spec.hash(),
+        schema_name=source.schema,
+        schema_version=newest if schema_version is None else min(schema_version, newest),
+        layout=layout,
+        code_version=__version__,
+        libraries={name: found for name, found in versions_of(_LIBRARIES).items() if found}
+        | arm_versions(spec.label_source),
+        platform=platform.platform(),
+        created=utc_now(),
+        sources=sources,
+    )
 
 
 def scene_engine_names(spec: Specification) -> set[str]:
@@ -165,35 +187,6 @@ def scene_engines(spec: Specification) -> dict[str, str]:
     return {name: version(name) for name in packages} | {"scenes": str(scenes_version(spec))}
 
 
-def read_toml(
-    path: Path, fix: str = "Give a TOML file as in docs/reference/specification.md"
-) -> dict[str, Any]:
-    """The content of a TOML file. InputError, with `fix`, where it is not TOML, too large or unreadable."""
-    data = read_regular(path, _MAX_CONFIG_BYTES, fix)
-    try:
-        return parse_toml(data.decode())
-    except ValueError as error:
-        raise InputError(path, "", f"is not TOML: {error}", fix) from None
-
-
-def parse_toml(text: str) -> dict[str, Any]:
-    """Return the content of TOML text. ValueError where it is not TOML, or nested too deeply."""
-    # The parser's memory grows with the square of the number of parts of a dotted key.
-    if any(line.count(".") > 1000 for line in text.splitlines()):
-        raise ValueError("nested too deeply: more than 1000 dots in a line")
-    try:
-        document = tomllib.loads(text)
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
-    level: list[Any] = [document]
-    for _ in range(_MAX_DEPTH):  # dotted keys nest without brackets, beyond the recursion limit
-        tables = [value.values() if isinstance(value, dict) else value for value in level]
-        level = [value for table in tables for value in table if isinstance(value, dict | list)]
-    if level:
-        raise ValueError("nested too deeply")
-    return document
-
-
 def put_field(fields: dict[str, Any], name: str, value: Any, config: Path | None) -> None:
     """Set a dotted name in nested dictionaries."""
     *parents, leaf = name.split(".")
@@ -203,3 +196,109 @@ def put_field(fields: dict[str, Any], name: str, value: Any, config: Path | None
             raise InputError(config or "", parent, "is a value, not a section", f"Write [{parent}]")
         fields = below
     fields[leaf] = value
+
+
+# The arm: the robot of `plan` and `sim` labels, and the candidates that suit it.
+
+
+def refuse_missing_packages(label_source: str) -> None:
+    """Raise InputError where the label source needs libraries that are not installed."""
+    for name in ARM_PACKAGES.get(label_source, ()):
+        try:
+            version(name)
+        except PackageNotFoundError:
+            raise InputError(
+                "label source", label_source, f"needs {name}, not installed", how_to_get("sim")
+            ) from None
+
+
+def arm_versions(label_source: str) -> dict[str, str]:
+    """Versions of the distributions that plan or simulate the arm of this label source."""
+    return {name: version(name) for name in ARM_PACKAGES.get(label_source, ())}
+
+
+def complete_arm(
+    label_source: str, fields: Fields, robot: str | None, repeats: int | None, place: str
+) -> None:
+    """Fill in the section `arm` of a specification's fields for this label source.
+
+    `robot` and `repeats` are the options --robot and --perturb, and override the section that came from
+    `place`. Raises InputError for what the label source does not support.
+    """
+    if repeats is not None and label_source not in ARM_PACKAGES:
+        fix = "Omit it, or submit plan or sim"
+        raise InputError("--perturb", str(repeats), f"{label_source} has no arm", fix)
+    if repeats is not None:
+        try:
+            DisturbanceParams(repeats=repeats)
+        except ValidationError as error:
+            problem = error.errors()[0]["msg"]
+            raise InputError("--perturb", str(repeats), problem, "Omit it for undisturbed labels") from None
+    if label_source not in ARM_PACKAGES:
+        if "arm" in fields:
+            raise InputError(place, "arm", f"{label_source} has no arm", "Remove the section")
+        return
+    arm = fields.setdefault("arm", {})
+    if not isinstance(arm, dict):
+        return  # the specification refuses it
+    for section in _NOT_FOR[label_source]:
+        if section in arm:
+            problem = f"{label_source} runs no trials"
+            raise InputError(place, f"arm.{section}", problem, "Remove the section, or submit sim")
+    if robot is not None:
+        arm["robot"] = robot
+    elif isinstance(named := arm.get("robot"), str) and named not in ROBOTS:
+        raise InputError(place, "arm.robot", f"{named!r} is unknown", choices(ROBOTS, str(named)))
+    if label_source == "sim":
+        arm.setdefault("trial", {})
+    if repeats is not None:
+        disturbance = arm.setdefault("disturbance", {})
+        if isinstance(disturbance, dict):
+            disturbance["repeats"] = repeats
+
+
+def robot_of(fields: Fields, robot: str | None) -> str | None:
+    """The robot that candidates must suit: --robot, or that of the arm; None for any."""
+    arm = fields.get("arm")
+    if robot is not None or not isinstance(arm, dict):
+        return robot
+    named = arm.get("robot", ArmParams().robot)
+    return named if isinstance(named, str) else None
+
+
+def narrow_candidates(fields: Fields, robot: str) -> None:
+    """Narrow the ranges that the fields do not set to those of the robot. InputError for an unknown one."""
+    limits, defaults = robot_limits(robot), CandidateParams()
+    candidates = fields.setdefault("candidates", {})
+    if not isinstance(candidates, dict):
+        return
+    if limits.reach_m[0] < limits.reach_m[1]:
+        candidates.setdefault("arm_reach_step_m", REACH_STEP_M)
+    candidates.setdefault("arm_reach_m", _narrowed(defaults.arm_reach_m, limits.reach_m))
+    if limits.base_height_m is not None:
+        candidates.setdefault("base_height_m", _narrowed(defaults.base_height_m, limits.base_height_m))
+    if limits.base_radius_m is not None:
+        candidates.setdefault("base_radius_m", limits.base_radius_m)
+
+
+def refuse_unsuited(spec: Specification, robot: str, place: str, fix: str) -> None:
+    """Raise InputError where candidates of this specification do not suit the robot."""
+    limits, candidates = robot_limits(robot), spec.candidates
+    for field, given, limit in (
+        ("arm_reach_m", candidates.arm_reach_m, limits.reach_m),
+        ("base_height_m", candidates.base_height_m, limits.base_height_m),
+    ):
+        if limit is not None and not limit[0] - _STEP_M <= given.low <= given.high <= limit[1] + _STEP_M:
+            has = f"{limit[0]:g} to {limit[1]:g} m" if limit[0] < limit[1] else f"{limit[0]:g} m"
+            problem = f"{given.low:g} to {given.high:g} m, and robot {robot} has {has}"
+            raise InputError(place, f"candidates.{field}", problem, fix)
+    own_m = limits.base_radius_m
+    if own_m is not None and candidates.base_radius_m < own_m - _STEP_M:
+        problem = f"{candidates.base_radius_m:g} m, and the base of robot {robot} has {own_m:g} m"
+        raise InputError(place, "candidates.base_radius_m", problem, fix)
+
+
+def _narrowed(default: Range, limit: tuple[float, float]) -> dict[str, float]:
+    """The intersection of default and limit, or the limit where it is empty."""
+    low, high = max(default.low, limit[0]), min(default.high, limit[1])
+    return {"low": low, "high": high} if low <= high else {"low": limit[0], "high": limit[1]}

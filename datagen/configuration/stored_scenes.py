@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from datagen.configuration.arms import ARM_PACKAGES, complete_arm, refuse_unsuited, robot_of
 from datagen.configuration.specify import (
+    ARM_PACKAGES,
+    complete_arm,
     label_engines,
     layout_of,
     put_field,
     read_fields,
+    refuse_unsuited,
+    robot_of,
     scene_engine_names,
     validated,
 )

@@ -1,4 +1,4 @@
-"""Verbs that are also Python functions, command lines to copy, and interruptions."""
+"""Verbs that are also Python functions, options declared once, command lines to copy, and interruptions."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import inspect
 import shlex
 import signal
 import sys
+import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from functools import wraps
 from threading import current_thread, main_thread
 from types import FrameType
@@ -25,8 +27,9 @@ def options_of(
 ) -> Callable[[Callable[[Options], Result]], Callable[Parameters, Result]]:
     """Give a verb the arguments of a dataclass, `kind`, in Python and on the command line.
 
-    The verb gets the dataclass as its only argument. Fields before `KW_ONLY` are positional; the section
-    `Args:` of the dataclass's docstring is their help, and `__post_init__` checks them.
+    The verb gets the dataclass as its only argument. Fields that are not keyword-only are positional. Their
+    help is in their annotations or in the section `Args:` of the dataclass's docstring, and `__post_init__`
+    checks them.
     """
 
     def with_options(verb: Callable[[Options], Result]) -> Callable[Parameters, Result]:
@@ -34,16 +37,20 @@ def options_of(
         def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
             return verb(kind(*args, **kwargs))
 
-        hints = get_type_hints(kind, include_extras=True)
+        plain = get_type_hints(kind)
         only = {inspect.Parameter.POSITIONAL_OR_KEYWORD: inspect.Parameter.POSITIONAL_ONLY}
         parameters = [
-            each.replace(annotation=hints[name], kind=only.get(each.kind, each.kind))
+            each.replace(annotation=plain[name], kind=only.get(each.kind, each.kind))
             for name, each in inspect.signature(kind).parameters.items()
         ]
+        # Its own fields before inherited ones.
+        parameters.sort(key=lambda each: (each.kind, each.name not in kind.__annotations__))
         arguments = (inspect.getdoc(kind) or "").partition("\n\n")[2]
-        vars(call)["__signature__"] = inspect.Signature(parameters)
+        returned = get_type_hints(verb)["return"]
+        vars(call)["__signature__"] = inspect.Signature(parameters, return_annotation=returned)
         call.__doc__ = f"{inspect.getdoc(verb)}\n\n{arguments}\n"
-        call.__annotations__ = hints
+        # The command line takes conversion and help from these.
+        call.__annotations__ = get_type_hints(kind, include_extras=True)
         return call
 
     return with_options
@@ -62,12 +69,15 @@ def prints(printer: Callable[..., int]) -> Callable[[Verb], Verb]:
     return with_printer
 
 
-class Interrupted(KeyboardInterrupt):
-    """The command stopped cleanly on request; `result` is what it would have returned."""
-
-    def __init__(self, message: str, result: Any) -> None:
-        self.result = result
-        super().__init__(message)
+def given_options(options: Any) -> dict[str, Any]:
+    """The options of a dataclass that differ from their defaults, by their names on the command line."""
+    return {
+        "--" + field.name.replace("_", "-"): value
+        for field in fields(options)
+        if field.kw_only
+        and field.name != "quiet"
+        and (value := getattr(options, field.name)) != field.default
+    }
 
 
 def words_of(options: Mapping[str, object]) -> list[str]:
@@ -79,6 +89,14 @@ def words_of(options: Mapping[str, object]) -> list[str]:
         elif value is not None and value is not False:
             words += [name, str(value)]
     return words
+
+
+class Interrupted(KeyboardInterrupt):
+    """The command stopped cleanly on request; `result` is what it would have returned."""
+
+    def __init__(self, message: str, result: Any) -> None:
+        self.result = result
+        super().__init__(message)
 
 
 def command_line(words: Sequence[str]) -> str:
@@ -123,3 +141,19 @@ def interruptible() -> Generator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+_began_s: float | None = None
+
+
+def begin_with_process() -> None:
+    """Let the command of this process begin with it, so that its time includes imports."""
+    import psutil
+
+    global _began_s
+    _began_s = time.monotonic() - max(0.0, time.time() - psutil.Process().create_time())
+
+
+def beginning_s() -> float:
+    """Monotonic time at which a command began: its process on the command line, else now."""
+    return time.monotonic() if _began_s is None else _began_s

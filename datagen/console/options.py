@@ -12,7 +12,7 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import Parameter, Token
+from cyclopts import Group, Parameter, Token
 
 from datagen.schemas.errors import InputError
 
@@ -27,6 +27,17 @@ def _whole_number(kind: Any, tokens: Sequence[Token]) -> int:
         shown = text if len(text) <= 40 else text[:37] + "..."
         raise ValueError(f'"{shown}" is not a whole number like 600, 180,000 or 1e5.')
     return int(value)
+
+
+# Headings in the help of verbs that make labels.
+LABELLED = Group.create_ordered("What is labelled")
+ROBOT = Group.create_ordered("Which robot")
+RUNNING = Group.create_ordered("How it runs")
+
+
+def option(text: str, group: Group) -> Parameter:
+    """An option with its help, under a heading."""
+    return Parameter(help=text, group=group)
 
 
 # 180000, 180,000 or 1e5. A plain int would read 2.5 as 2.
@@ -60,22 +71,20 @@ def refuse_output(file: Path, option: str, *endings: str) -> None:
 
 
 @Parameter(name="*")
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AssetSources:
     """References of houses and objects from the command line; None: those in the run's manifest."""
 
-    houses: Annotated[str | None, Parameter(help="New location of the houses [as in the run].")] = None
-    objects: Annotated[str | None, Parameter(help="New location of the objects [as in the run].")] = None
+    houses: Annotated[str | None, Parameter(help="New location of the houses.")] = None
+    objects: Annotated[str | None, Parameter(help="New location of the objects.")] = None
 
 
 @Parameter(name="*")
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Sources(AssetSources):
     """References of houses, objects and the run whose scenes a run labelled again."""
 
-    scenes_from: Annotated[
-        str | None, Parameter(help="New location of the run with the scenes [as in the run].")
-    ] = None
+    scenes_from: Annotated[str | None, Parameter(help="New location of the run with the scenes.")] = None
 
 
 AS_FOUND = Sources()

@@ -63,7 +63,7 @@ print("ray " + ray.__version__)
 
 _AGAIN = "Install it again: pip install --force-reinstall"
 _MESA_FIX = (
-    "Only --renderer sapien needs one; on a CPU it works with Mesa 25 or newer: "
+    "Only the renderer sapien needs one; on a CPU it works with Mesa 25 or newer: "
     "on Debian 12 apt-get install -t bookworm-backports mesa-vulkan-drivers"
 )
 
@@ -108,8 +108,12 @@ def engine_checks() -> list[Check]:
     # One broken settler is a warning; without any, scenes cannot be settled.
     lost = "warn" if any(found[name].succeeded for name in settlers) else "fail"
     findings: dict[str, tuple[str, Status, str]] = {
-        "sapien": ("sapien physics", lost, "Install the libraries named above, or use --settler pybullet."),
-        "pybullet": ("pybullet", lost, f"{_AGAIN} pybullet; or use --settler sapien."),
+        "sapien": (
+            "sapien physics",
+            lost,
+            "Install the libraries named above, or settle.engine pybullet.",
+        ),
+        "pybullet": ("pybullet", lost, f"{_AGAIN} pybullet; or settle with sapien."),
         "embreex": ("embree", "fail", f"{_AGAIN} embreex"),
         "ray": ("ray", "warn", f"{_AGAIN} ray; or use --workers 0."),
     }

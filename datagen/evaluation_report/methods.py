@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
-from datagen.configuration.specify import first_of, read_toml
+from datagen.configuration.toml_files import first_of, read_toml
 from datagen.display.progress import steps
 from datagen.evaluation_report.evaluated_runs import SCENES_PER_BATCH, EvaluatedRun, refuse_no_trials
 from datagen.released import RELEASED, released_checkpoint

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NotRequired
 from pydantic import Field, TypeAdapter, ValidationError
 from typing_extensions import TypedDict  # pydantic reads typing's from Python 3.12 on
 
-from datagen.configuration.specify import first_of
+from datagen.configuration.toml_files import first_of
 from datagen.schemas.errors import InputError
 from datagen.schemas.untrusted_files import read_regular
 

@@ -19,7 +19,6 @@ from datagen.html_report.report_paths import ReportedPart
 from datagen.html_report.run_figures import BALANCE_CAPTION, SHARDS_CAPTION, draw_balance, draw_shards
 from datagen.html_report.unusual_scenes import unusual_scenes
 from datagen.reports.run_status import status_report
-from datagen.reports.specification_summary import made_from
 from datagen.schemas.description import described
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.quarantine import lifted_records
@@ -134,7 +133,7 @@ def _provenance(part: ReportedPart) -> list[str]:
     body = ["<h3>Provenance and licences</h3>"]
     if part.run is not None:
         manifest = part.run.manifest
-        facts = [("made from", made_from([manifest])), *facts, *_origin(manifest)]
+        facts = [("made from", manifest.made_from), *facts, *_origin(manifest)]
     body.append(html_facts(facts))
     if part.run is not None:
         body += _lineage(part.run)

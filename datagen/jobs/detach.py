@@ -8,21 +8,26 @@ import shlex
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from datagen.cluster.cluster_folders import write_private
 from datagen.cluster.environment import JOB_ENVIRONMENT, is_of_the_shell
+from datagen.cluster.job_monitor import JOBS_API, SUBMISSION
 from datagen.cluster.ray_head import ensure_head, head_token
 from datagen.cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
 from datagen.console.command_lines import command_line
 from datagen.console.printing import print_rows
+from datagen.jobs.job import JobOptions
 from datagen.jobs.job_report import JobResult
-from datagen.jobs.options import JOBS_API, SUBMISSION, JobOptions
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import new_job_id
 
 _BEGUN_WITHIN_S = 60.0
 _POLL_S = 0.3
+
+Options = TypeVar("Options", bound=JobOptions)
 
 
 def detach_job(words: Sequence[str], path: str, job_options: JobOptions) -> JobResult:
@@ -32,17 +37,16 @@ def detach_job(words: Sequence[str], path: str, job_options: JobOptions) -> JobR
     the command has begun or is queued. InputError where the cluster cannot be reached or refuses the job.
     """
     submission = f"datagen-{new_job_id()}"
-    address = [] if job_options.workers == 0 else ["--address", "auto"]
     if job_options.address == "local":
         head = ensure_head(job_options.workers or len(os.sched_getaffinity(0)))
         jobs = open_ray_jobs(head.jobs_api, head.token)
         # The program that was called: the head runs on this machine, as this user.
-        entrypoint = shlex.join([sys.executable, "-m", "datagen.cli", *words, *address])
+        entrypoint = shlex.join([sys.executable, "-m", "datagen.cli", *words])
         file = hand_over(jobs, Path(head.folder), submission)
         environment = {SUBMISSION: submission, JOBS_API: jobs.url, JOB_ENVIRONMENT: str(file)}
     else:
         jobs = open_ray_jobs(job_options.address)
-        entrypoint = shlex.join(["datagen", *words, *address])  # as installed on the cluster
+        entrypoint = shlex.join(["datagen", *words])  # as installed on the cluster
         environment = {SUBMISSION: submission, JOBS_API: jobs.url}
     jobs.submit(entrypoint, submission, environment)
     state = _await_begin(jobs, submission)
@@ -51,13 +55,17 @@ def detach_job(words: Sequence[str], path: str, job_options: JobOptions) -> JobR
         ("state", state.lower()),
         ("cluster", jobs.url),
         ("follow", command_line(["status", path])),
-        ("", command_line(["logs", path, "--follow"])),
         ("stop", command_line(["cancel", path])),
     ]
     if job_options.address == "local":
         rows.append(("Ray", f"keeps running for later jobs; stop it: {command_line(['cancel', '--head'])}"))
     print_rows(f"detached: {command_line(words)}", rows)
     return JobResult(path, "detached")
+
+
+def in_ray_job(options: Options) -> Options:
+    """The options with which a Ray job runs a command that was detached with these."""
+    return replace(options, detach=False, address="auto")
 
 
 def hand_over(jobs: RayJobs, folder: Path, submission: str) -> Path:
@@ -70,14 +78,6 @@ def hand_over(jobs: RayJobs, folder: Path, submission: str) -> Path:
     given = {n: value for n, value in os.environ.items() if is_of_the_shell(n) and n not in own}
     write_private(file, json.dumps(given))
     return file
-
-
-def detached_words() -> list[str]:
-    """In a detached job, the options that detach its command again in the same way."""
-    jobs_api = os.environ.get(JOBS_API, "")
-    if not jobs_api:
-        return []
-    return ["--detach"] if head_token(jobs_api) else ["--detach", "--address", jobs_api]
 
 
 def _await_begin(jobs: RayJobs, submission: str) -> str:

@@ -1,42 +1,89 @@
-"""A job: make the missing shards on this machine or a cluster, publish its status, print a summary."""
+"""A job: make the missing shards on this machine or a cluster, publish its status, seal."""
 
 from __future__ import annotations
 
+import io
 import os
-import platform
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+from cyclopts import Parameter
+from rich.console import Console
 
 from datagen.cluster.attempt import run_attempt
-from datagen.cluster.budget import BudgetGuard
+from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
-from datagen.cluster.job_progress import JobMonitor, JobProgress, JobStatus, StopMode, TimeLeft
-from datagen.cluster.job_totals import End, JobSummary, JobTotals, empty_summary
-from datagen.cluster.post_mortem import notes_of_a_job
+from datagen.cluster.job_monitor import JobMonitor, JobRecorder
 from datagen.cluster.preflight import refuse_unfit_machines
-from datagen.cluster.ray_cluster import RaySettings
+from datagen.cluster.protocol import (
+    Executor,
+    JobSummary,
+    JobTotals,
+    ShardTask,
+    StopRequest,
+    empty_summary,
+    stop_on_signals,
+)
+from datagen.cluster.ray_cluster import RaySettings, refuse_unusable
 from datagen.cluster.ray_executor import RayExecutor, ray_executor
-from datagen.cluster.retry_policy import RetryPolicy, too_many_quarantined
-from datagen.cluster.run_forecast import RunForecast
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
-from datagen.cluster.stop_request import StopRequest, stop_on_signals
-from datagen.cluster.task import Executor, ShardTask
-from datagen.console.command_lines import command_line
+from datagen.cluster.shard_policy import RetryPolicy, too_many_quarantined
+from datagen.console.command_lines import Interrupted, command_line, resumable
+from datagen.console.options import RUNNING, Whole, option
+from datagen.console.printing import counted
 from datagen.display.progress import Progress
-from datagen.jobs.evidence import made_here
 from datagen.jobs.job_report import JobResult
-from datagen.jobs.options import JOBS_API, SUBMISSION, JobOptions
-from datagen.reports.specification_summary import made_from
 from datagen.schemas.errors import InputError
-from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, JobState, new_job_id
-from datagen.schemas.record_files import utc_now
+from datagen.schemas.jobs import JobEnd, Jobs
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage
+from datagen.workers.extras import refuse_missing
+
+_DETACH = (
+    "Run as a Ray job that continues after this shell ends: on the cluster of --address (its dashboard "
+    "http://HOST:8265 or the cluster itself), else on a Ray head of this machine."
+)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class JobOptions:
+    """Where and how a job runs; no option changes a sample."""
+
+    workers: Annotated[
+        Whole | None,
+        option("Worker processes; 0: this process, for debuggers. [default: one per core]", RUNNING),
+    ] = None
+    address: Annotated[str, option("local, or the address of a Ray cluster.", RUNNING)] = "local"
+    detach: Annotated[bool, option(_DETACH, RUNNING)] = False
+    json: Annotated[bool, option("Print progress as JSON lines to standard error.", RUNNING)] = False
+    quiet: Annotated[bool, Parameter(parse=False)] = False  # the command line always reports progress
+
+    def refuse_bad(self) -> None:
+        """Raise InputError for values out of range and, unless detached, for an unreachable cluster."""
+        if self.workers is not None and not 0 <= self.workers <= 4096:
+            fix = "Omit it for one per core"
+            raise InputError("--workers", str(self.workers), "is not between 0 and 4096", fix)
+        if self.workers != 0 or self.detach:
+            refuse_missing("cluster", "" if self.detach else "or work in this process: --workers 0")
+        if self.workers != 0 and not self.detach:
+            refuse_unusable(self.address)
+
+    def display(self) -> Progress:
+        """The display of progress on standard error."""
+        return Progress(self.json, console=Console(file=io.StringIO()) if self.quiet else None)
+
+
+def refuse_odd_n(n: int) -> None:
+    """Raise InputError for a number of labels out of range."""
+    if not 1 <= n <= 10**12:
+        raise InputError("--n", str(n), "is not between 1 and 10^12", "Give the number of labels wanted")
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,39 +97,166 @@ class JobRun:
 
 
 @dataclass(frozen=True, eq=False)
-class JobPlan:
-    """The work of a job: the missing shards of one run, or of the parts of merged runs."""
+class Job:
+    """Makes the missing shards of one run, or of the parts of merged runs."""
 
     storage: Storage  # where the job's records and the sealed store go
     path: str  # as the user wrote it
     runs: Sequence[JobRun]
     options: JobOptions
     began_s: float  # by the monotonic clock, when the command began to open them
-    command: Sequence[str]  # the words of the command that started it
-    resume: Sequence[str]  # the words of the command that resumes it
+    command: Sequence[str] = ()  # the words of the command that started it
+    resume: Sequence[str] = ()  # the words of the command that resumes it
+    policy: RetryPolicy = field(default_factory=RetryPolicy)
 
+    def run(self) -> JobResult:
+        """Make every missing shard, seal, and return the result.
 
-def run_job(plan: JobPlan) -> JobResult:
-    """Make every missing shard, seal, and return the result.
+        Meanwhile the job publishes its state in the run, and polls it for stop requests. Raises InputError
+        for an error that no retry can fix, and Interrupted where it was asked to stop.
+        """
+        with resumable(self.resume):
+            result = self._run()
+        if result.end == "interrupted":
+            left = counted(result.remaining, "shard")
+            raise Interrupted(f"{left} left. Resume with: {command_line(self.resume)}", result)
+        return result
 
-    Meanwhile the job publishes its state in the run, and polls it for stop requests. Raises
-    InputError for an error that no retry can fix.
-    """
-    if not _count_missing(plan):
-        for job_run in plan.runs:
+    def _run(self) -> JobResult:
+        if not self._count_missing():
+            for job_run in self.runs:
+                close_lost_attempts(job_run.run)
+            return self._finish(self._judged(empty_summary()))
+        recorder = self.record()
+        try:
+            summary = self._judged(self.make_missing(recorder))
+            recorder.seal()
+            result = self._finish(summary)
+        except BaseException as error:
+            end, code = _end_of(error)
+            recorder.end(end, code, " ".join(str(error).split())[:1000])
+            raise
+        recorder.end(summary.end, result.exit_code, summary.cause, summary)
+        return result
+
+    def record(self) -> JobRecorder:
+        """Publish the job's record."""
+        command = ("datagen", *self.command)
+        return JobRecorder(Jobs(self.storage), command, self.options.address, self._count_missing())
+
+    def make_missing(self, recorder: JobRecorder) -> JobSummary:
+        """Drive one run after the other on one set of workers; return the summary."""
+        missing, stop = [job_run.run.missing() for job_run in self.runs], StopRequest()
+        whole = empty_summary()
+        with ExitStack() as stack:
+            notes = stack.enter_context(notes_of_a_job())
+            shown = stack.enter_context(self.options.display())
+            executor = self._executor(sum(map(len, missing)), stack, shown)
+            stack.enter_context(stop_on_signals(stop, interrupt=self.options.workers == 0))
+            for job_run, shards in zip(self.runs, missing, strict=True):
+                if whole.end in ("interrupted", "aborted"):
+                    whole = replace(whole, totals=whole.totals.plus(JobTotals(len(shards))))
+                elif shards:
+                    whole = whole.plus(self._drive(job_run, shards, executor, recorder, stop, shown, notes))
+                    recorder.add(whole.totals)
+            whole = replace(whole, start_s=time.monotonic() - self.began_s - whole.elapsed_s)
+        for job_run in self.runs:
+            # Attempts of killed drivers are closed last: their workers may still commit.
             close_lost_attempts(job_run.run)
-        return _finish(plan, _judged(plan, empty_summary()))
-    recorder = open_recorder(plan)
-    try:
-        summary = _judged(plan, make_missing(plan, recorder))
-        recorder.seal()
-        result = _finish(plan, summary)
-    except BaseException as error:
-        end, code = _end_of(error)
-        recorder.end(end, code, " ".join(str(error).split())[:1000])
-        raise
-    recorder.end(summary.end, result.exit_code, summary.cause, summary)
-    return result
+        return whole
+
+    def _drive(
+        self,
+        job_run: JobRun,
+        shards: Sequence[int],
+        executor: Executor[ShardTask],
+        recorder: JobRecorder,
+        stop: StopRequest,
+        shown: Progress,
+        notes: str,
+    ) -> JobSummary:
+        run = job_run.run
+        layout, spec = run.layout, run.manifest.spec
+
+        def make_task(order: AttemptOrder) -> ShardTask:
+            return ShardTask(
+                run=run.storage.url,
+                spec=spec,
+                layout=layout,
+                shard=order.shard,
+                attempt=order.attempt,
+                houses=job_run.houses,
+                objects=job_run.objects,
+                deadline_s=order.deadline_s,
+                notes=notes,
+                scenes_from=job_run.scenes_from,
+            )
+
+        if isinstance(executor, RayExecutor):
+            shown.phase("checking the machines")
+            probe = make_task(AttemptOrder(shards[0], "probe", deadline_s=0.0))
+            refuse_unfit_machines(executor.others.ask, run, probe)
+        shown.phase("making labels")
+        done = len(run.planned()) - len(shards)
+        events = JobMonitor(recorder, stop, shown, layout.samples_per_shard, done)
+        return drive(shards, make_task, executor, RunRecorder(run), self.policy, events, stop)
+
+    def _executor(self, shards: int, stack: ExitStack, shown: Progress) -> Executor[ShardTask]:
+        if self.options.workers == 0:
+            return InProcessExecutor(run_attempt)
+        shown.phase("starting Ray")
+        cores = len(os.sched_getaffinity(0))
+        workers = min(self.options.workers or cores, shards)  # Ray starts them all at once
+        settings = RaySettings(address=self.options.address, workers=workers)
+        return stack.enter_context(ray_executor(run_attempt, settings))
+
+    def _count_missing(self) -> int:
+        return sum(len(job_run.run.missing()) for job_run in self.runs)
+
+    def _judged(self, summary: JobSummary) -> JobSummary:
+        """Decide whether a finished job failed, by the quarantined share of the whole run.
+
+        The driver knows only its own shards, which may be the last two of a thousand.
+        """
+        if summary.end not in ("complete", "failed") or summary.remaining:
+            return summary
+        quarantined = planned = 0
+        for job_run in self.runs:
+            shards = job_run.run.planned()
+            planned += len(shards)
+            quarantined += sum(shard in shards for shard in job_run.run.quarantined())
+        failed = too_many_quarantined(self.policy, quarantined, planned)
+        return replace(summary, end="failed" if failed else "complete")
+
+    def _finish(self, summary: JobSummary) -> JobResult:
+        """Seal the run, unless the job was stopped, and return the result."""
+        totals, runs = summary.totals, [job_run.run for job_run in self.runs]
+        causes = Counter(r.causes[-1] for run in runs for r in run.quarantine_records() if r.causes)
+        if summary.end == "aborted":
+            fix = f"Then resume: {command_line(self.resume)}"
+            raise _CannotContinue(self.path, "", f"the job cannot continue: {summary.cause}", fix)
+        does_seal = summary.end != "interrupted" and any(run.committed() for run in runs)
+        return JobResult(
+            path=self.path,
+            end=summary.end,
+            n=sum(run.n for run in runs),
+            made_from="; ".join(dict.fromkeys(run.manifest.made_from for run in runs)),
+            labels=totals.labels,
+            positives=totals.positives,
+            shards=totals.shards,
+            remaining=summary.remaining,
+            quarantined=tuple(shard for run in runs for shard in sorted(run.quarantined())),
+            retries=totals.retries,
+            start_s=summary.start_s,
+            elapsed_s=summary.elapsed_s,
+            store=seal(self.storage) if does_seal else "",
+            cause=summary.cause or (causes.most_common(1)[0][0] if causes else ""),
+            resume=tuple(self.resume),
+        )
+
+
+class _CannotContinue(InputError):
+    """The job met an error that no retry can fix."""
 
 
 def _end_of(error: BaseException) -> tuple[JobEnd, int]:
@@ -91,233 +265,3 @@ def _end_of(error: BaseException) -> tuple[JobEnd, int]:
     if isinstance(error, _CannotContinue):
         return "aborted", 2
     return "broken", 2 if isinstance(error, InputError) else 1
-
-
-def open_recorder(plan: JobPlan) -> JobRecorder:
-    """Publish the job's record."""
-    record = JobRecord(
-        id=new_job_id(),
-        command=("datagen", *plan.command),
-        host=platform.node(),
-        pid=os.getpid(),
-        started=utc_now(),
-        address=plan.options.address,
-        submission=os.environ.get(SUBMISSION, ""),
-        jobs_api=os.environ.get(JOBS_API, ""),
-    )
-    recorder = JobRecorder(Jobs(plan.storage), record, _count_missing(plan))
-    recorder.begin()
-    return recorder
-
-
-def _count_missing(plan: JobPlan) -> int:
-    return sum(len(job_run.run.missing()) for job_run in plan.runs)
-
-
-def make_missing(plan: JobPlan, recorder: JobRecorder) -> JobSummary:
-    """Drive one run after the other on one set of workers; return the summary."""
-    missing = [job_run.run.missing() for job_run in plan.runs]
-    job_options, stop = plan.options, StopRequest()
-    budget = None if job_options.limit is None else BudgetGuard(job_options.limit, plan.began_s)
-    policy = RetryPolicy(max_quarantined_share=job_options.max_quarantined)
-    whole = empty_summary()
-    with ExitStack() as stack:
-        notes = stack.enter_context(notes_of_a_job())
-        shown = stack.enter_context(job_options.display())
-        executor = _executor(job_options, sum(map(len, missing)), stack, shown)
-        stack.enter_context(stop_on_signals(stop, interrupt=job_options.workers == 0))
-        for job_run, shards in zip(plan.runs, missing, strict=True):
-            if whole.end in ("interrupted", "aborted", "budget"):
-                whole = replace(whole, totals=whole.totals.plus(JobTotals(len(shards))))
-            elif shards:
-                whole = whole.plus(
-                    _drive(job_run, shards, executor, policy, recorder, stop, shown, notes, budget)
-                )
-                recorder.add(whole.totals)
-        whole = replace(whole, start_s=time.monotonic() - plan.began_s - whole.elapsed_s)
-    for job_run in plan.runs:
-        # Attempts of killed drivers are closed last: their workers may still commit.
-        close_lost_attempts(job_run.run)
-    return whole
-
-
-def _drive(
-    job_run: JobRun,
-    shards: Sequence[int],
-    executor: Executor[ShardTask],
-    policy: RetryPolicy,
-    recorder: JobRecorder,
-    stop: StopRequest,
-    shown: Progress,
-    notes: str,
-    budget: BudgetGuard | None,
-) -> JobSummary:
-    run = job_run.run
-    layout, spec = run.layout, run.manifest.spec
-
-    def make_task(order: AttemptOrder) -> ShardTask:
-        return ShardTask(
-            run=run.storage.url,
-            spec=spec,
-            layout=layout,
-            shard=order.shard,
-            attempt=order.attempt,
-            houses=job_run.houses,
-            objects=job_run.objects,
-            deadline_s=order.deadline_s,
-            notes=notes,
-            scenes_from=job_run.scenes_from,
-        )
-
-    if isinstance(executor, RayExecutor):
-        shown.phase("checking the machines")
-        probe = make_task(AttemptOrder(shards[0], "probe", deadline_s=0.0))
-        refuse_unfit_machines(executor.others.ask, run, probe)
-    done, per_shard = len(run.planned()) - len(shards), layout.samples_per_shard
-    shown.phase("making labels")
-    forecast = RunForecast(layout.scenes_per_shard, made_here(run))
-    left = TimeLeft(forecast, lambda: executor.slots)
-    if budget is not None:
-        budget.use(forecast)
-    events = JobMonitor(recorder, stop, per_shard, JobProgress(shown, per_shard, done, left), left)
-    recorder_of_run = RunRecorder(run)
-    return drive(shards, make_task, executor, recorder_of_run, policy, events, stop, budget=budget)
-
-
-def _judged(plan: JobPlan, summary: JobSummary) -> JobSummary:
-    """Decide whether a finished job failed, by the quarantined share of the whole run.
-
-    The driver knows only its own shards, which may be the last two of a thousand.
-    """
-    if summary.end not in ("complete", "failed") or summary.remaining:
-        return summary
-    quarantined = planned = 0
-    for job_run in plan.runs:
-        shards = job_run.run.planned()
-        planned += len(shards)
-        quarantined += sum(shard in shards for shard in job_run.run.quarantined())
-    policy = RetryPolicy(max_quarantined_share=plan.options.max_quarantined)
-    failed = too_many_quarantined(policy, quarantined, planned)
-    return replace(summary, end="failed" if failed else "complete")
-
-
-def _executor(job_options: JobOptions, shards: int, stack: ExitStack, shown: Progress) -> Executor[ShardTask]:
-    if job_options.workers == 0:
-        return InProcessExecutor(run_attempt)
-    shown.phase("starting Ray")
-    cores = len(os.sched_getaffinity(0))
-    workers = min(job_options.workers or cores, shards)  # Ray starts them all at once
-    ray_settings = RaySettings(address=job_options.address, workers=workers)
-    return stack.enter_context(ray_executor(run_attempt, ray_settings))
-
-
-class _CannotContinue(InputError):
-    """The job met an error that no retry can fix."""
-
-
-def _finish(plan: JobPlan, summary: JobSummary) -> JobResult:
-    """Seal the run, unless the job was stopped, and return the result."""
-    totals, runs = summary.totals, [job_run.run for job_run in plan.runs]
-    causes = Counter(r.causes[-1] for run in runs for r in run.quarantine_records() if r.causes)
-    if summary.end == "aborted":
-        fix = f"Then resume: {command_line(plan.resume)}"
-        raise _CannotContinue(plan.path, "", f"the job cannot continue: {summary.cause}", fix)
-    does_seal = summary.end not in ("interrupted", "budget") and any(run.committed() for run in runs)
-    return JobResult(
-        path=plan.path,
-        end=summary.end,
-        n=sum(run.n for run in runs),
-        made_from=made_from(run.manifest for run in runs),
-        labels=totals.labels,
-        positives=totals.positives,
-        shards=totals.shards,
-        remaining=summary.remaining,
-        quarantined=tuple(shard for run in runs for shard in sorted(run.quarantined())),
-        retries=totals.retries,
-        start_s=summary.start_s,
-        elapsed_s=summary.elapsed_s,
-        store=seal(plan.storage) if does_seal else "",
-        budget=plan.options.budget or "",
-        cause=summary.cause or (causes.most_common(1)[0][0] if causes else ""),
-        resume=tuple(plan.resume),
-    )
-
-
-class JobRecorder:
-    """The status records of one job over one run or several. `shards` is the number that it has to make.
-
-    A state that cannot be written, or a request that cannot be read, is ignored: an error of the store also
-    fails the commits, which report it.
-    """
-
-    def __init__(self, jobs: Jobs, record: JobRecord, shards: int) -> None:
-        self._jobs, self._record, self._shards = jobs, record, shards
-        self._before = JobTotals(0)  # of the runs that this job has finished
-        self._last = JobState(id=record.id, updated=utc_now(), phase="starting", shards=shards)
-
-    def begin(self) -> None:
-        """Publish the job. InputError where its record cannot be written: then no shard could be."""
-        self._jobs.begin(self._record)
-        self._put(self._last)
-
-    def add(self, totals: JobTotals) -> None:
-        """Record that a run is finished; `totals` are the job's so far."""
-        self._before = totals
-
-    def publish(self, status: JobStatus) -> None:
-        totals, interval = self._before.plus(status.totals), status.left_80_s
-        self._put(
-            self._last.model_copy(
-                update={
-                    **_counts(totals),
-                    "updated": utc_now(),
-                    "phase": "making",
-                    "labels_per_s": status.labels_per_s,
-                    "left_s": status.left_s,
-                    "left_80_s": interval and (interval.low, interval.high),
-                    "stopping": status.stopping,
-                }
-            )
-        )
-
-    def stop_requested(self) -> StopMode | None:
-        with suppress(InputError):
-            if (order := self._jobs.stop_order(self._record.id)) is not None:
-                return "force" if order.now else "drain"
-        return None
-
-    def seal(self) -> None:
-        """Publish that the shards are made and the store is being sealed."""
-        self._put(self._last.model_copy(update={"updated": utc_now(), "phase": "sealing", "in_flight": 0}))
-
-    def end(self, end: JobEnd | End, code: int, cause: str, summary: JobSummary | None = None) -> None:
-        """Publish how the job ended."""
-        update = {
-            "updated": utc_now(),
-            "phase": "ended",
-            "end": end,
-            "exit_code": code,
-            "cause": cause,
-            "in_flight": 0,
-            "left_s": None,
-            "left_80_s": None,
-        }
-        if summary is not None:
-            rate = summary.totals.labels / summary.elapsed_s if summary.elapsed_s > 0 else 0.0
-            update |= {**_counts(summary.totals), "in_flight": 0, "labels_per_s": rate}
-        self._put(self._last.model_copy(update=update))
-
-    def _put(self, state: JobState) -> None:
-        self._last = state
-        with suppress(InputError):
-            self._jobs.put_state(state)
-
-
-def _counts(totals: JobTotals) -> dict[str, int]:
-    return {
-        "done": totals.finished,
-        "in_flight": totals.in_flight,
-        "labels": totals.labels,
-        "retries": totals.retries,
-        "quarantined": totals.quarantined,
-    }

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from datagen.cluster.run_forecast import shown_range
-from datagen.cluster.shard_costs import Interval
-from datagen.console.command_lines import command_line, print_interrupted, resume_with
-from datagen.console.printing import counted, listed, print_json, print_rows, seconds
-from datagen.jobs.forecast import Forecast, print_forecast
+from datagen.cluster.protocol import EXIT_CODES
+from datagen.console.command_lines import command_line, print_interrupted
+from datagen.console.printing import counted, listed, print_json, print_lines, print_rows, seconds
 from datagen.schemas.errors import one_line
 from datagen.schemas.jobs import StoredJob
-
-_EXIT_CODES = {
-    **{"complete": 0, "detached": 0, "dry-run": 0},
-    **{"failed": 1, "aborted": 2, "budget": 3, "interrupted": 130},
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +18,8 @@ class JobResult:
     """The result of a job, and the state of its run. Quarantined shards are those that failed repeatedly."""
 
     path: str  # the run, as the user wrote it
-    # detached: Ray makes the labels. failed: more shards are quarantined than allowed. budget: it allows no
-    # further shard. dry-run: nothing was made.
-    end: Literal["complete", "budget", "failed", "interrupted", "aborted", "detached", "dry-run"]
+    # detached: Ray makes the labels. failed: too many shards are quarantined. dry-run: nothing was made.
+    end: Literal["complete", "failed", "interrupted", "detached", "dry-run"]
     n: int = 0  # labels wanted
     made_from: str = ""  # houses, objects and robot
     labels: int = 0  # made by this job
@@ -40,10 +31,9 @@ class JobResult:
     start_s: float = 0.0  # until the first shard began
     elapsed_s: float = 0.0  # from then on
     store: str = ""  # the sealed store, which zarr and xarray open
-    cause: str = ""  # of an aborted job, and the most frequent one of a failed job
-    resume: tuple[str, ...] = ()  # the words of the command that continues
-    budget: str = ""  # as given
-    forecast: Forecast | None = None  # of a dry run
+    scenes: int = 0  # that a dry run would make
+    cause: str = ""  # the most frequent one of a failed job
+    resume: tuple[str, ...] = ()  # words of the command that continues, or of a dry run
 
     @property
     def complete(self) -> bool:
@@ -52,8 +42,8 @@ class JobResult:
 
     @property
     def exit_code(self) -> int:
-        """The command line's exit status: 0 good, 1 too many failures, 2 aborted, 3 budget, 130 stopped."""
-        return _EXIT_CODES[self.end]
+        """The command line's exit status: 0 good, 1 too many failures, 130 stopped."""
+        return EXIT_CODES.get(self.end, 0)
 
 
 def job_report(job: StoredJob) -> dict[str, Any]:
@@ -83,9 +73,6 @@ def health_line(job: StoredJob) -> str:
     if state is None or state.phase == "starting":
         return f"{'silent' if health == 'silent' else 'starting'}, {heard} ({where})"
     left = "?" if state.left_s is None else seconds(state.left_s)
-    if state.left_80_s is not None:
-        low_s, high_s = state.left_80_s
-        left = shown_range(Interval(low_s, (low_s + high_s) / 2, high_s))
     doing = "sealing" if state.phase == "sealing" else f"{state.labels_per_s:,.1f} labels/s, {left} left"
     if state.stopping:
         doing = f"stopping, {state.in_flight} running"
@@ -95,29 +82,28 @@ def health_line(job: StoredJob) -> str:
     return f"{silent}{state.done} of {counted(state.shards, 'shard')}, {doing}, {heard} ({where})"
 
 
-def print_job(result: JobResult, *, job: Mapping[str, Any] | None = None, **_: Any) -> int:
-    """Print the summary of a job and return the exit code. `job` has the options of the job."""
-    as_json = bool((job or {}).get("json"))
-    if result.forecast is not None and as_json:
-        print_json({"run": result.path, **result.forecast.record()})
-    elif result.forecast is not None:
-        print_forecast(result.path, result.forecast)
+def print_job(result: JobResult, *, json: bool = False, **_: Any) -> int:
+    """Print the summary of a job and return the exit code."""
+    if result.end == "dry-run":
+        _print_dry_run(result, json)
     elif result.end != "detached":  # `detach_job` has printed how to follow it
         _print(result)
-        if result.end == "budget":
-            _print_budget(result, as_json)
     return result.exit_code
 
 
-def _print_budget(result: JobResult, as_json: bool) -> None:
-    """Print on standard error that the budget is spent, and how to resume with another one."""
-    if as_json:
-        again = {"remaining": result.remaining, "exit_code": result.exit_code, "resume": list(result.resume)}
-        values = {"event": "budget", "budget": result.budget, "labels": result.labels, **again}
-        print_json(values, indent=None, to=sys.stderr)
+def _print_dry_run(result: JobResult, json: bool) -> None:
+    command = command_line(result.resume)
+    if json:
+        report = {"run": result.path, "n": result.n, "made_from": result.made_from}
+        print_json(report | {"scenes": result.scenes, "shards": result.shards, "command": command})
         return
-    left = counted(result.remaining, "shard")
-    sys.stderr.write(f"budget of {result.budget} spent; {left} left. {resume_with(result.resume)}\n")
+    rows = [
+        ("labels", f"{result.n:,}"),
+        ("made from", result.made_from),
+        ("missing", f"{counted(result.shards, 'shard')} of {counted(result.scenes, 'scene')}"),
+    ]
+    print_rows(f"dry run: {result.path}", rows)
+    print_lines(f"Make them with:\n  {command}")
 
 
 def _print(result: JobResult) -> None:

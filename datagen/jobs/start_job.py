@@ -1,43 +1,53 @@
-"""Open the sources of an existing run and start its job, for `submit`, `resume` and `extend`."""
+"""Open an existing run for a job; paths and commands that mean the same elsewhere."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import os
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+from typing import Any, TypeVar
 
-from datagen.configuration.arms import refuse_missing_packages
-from datagen.configuration.specify import label_engines, scene_engines
-from datagen.console.command_lines import Interrupted, command_line, resumable, words_of
+from datagen.cluster.job_monitor import JOBS_API
+from datagen.cluster.ray_head import head_token
+from datagen.configuration.specify import label_engines, refuse_missing_packages, scene_engines
+from datagen.console.command_lines import given_options, words_of
 from datagen.console.options import AS_FOUND, Sources
-from datagen.console.printing import counted
 from datagen.doctor.engines import probe_render_device
-from datagen.jobs.detach import detach_job, detached_words
-from datagen.jobs.dry_run import PlannedRun, dry_run
-from datagen.jobs.job import JobPlan, JobRun, run_job
-from datagen.jobs.job_report import JobResult
-from datagen.jobs.options import JobOptions, absolute_path, absolute_source, opening
+from datagen.jobs.job import JobOptions, JobRun
 from datagen.regeneration.scenes import open_sources
-from datagen.schemas.errors import InputError
-from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.errors import InputError, refuse_not_utf8
 from datagen.schemas.record_files import different_fields
 from datagen.schemas.run import Run
-from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.specification import Specification
-from datagen.schemas.storage import Storage, open_storage
 from datagen.workers.extras import missing_library
 from datagen.workers.labels import load_label_source
 from datagen.workers.robots import gripper_of
 
+Options = TypeVar("Options", bound=Any)  # a dataclass of options
 
-def source_words(given: Sources) -> list[str]:
-    """The options for the same sources, with absolute paths."""
-    return words_of(
-        {
-            "--houses": given.houses and absolute_source(given.houses),
-            "--objects": given.objects and absolute_source(given.objects),
-            "--scenes-from": given.scenes_from and absolute_path(given.scenes_from),
-        }
-    )
+
+def with_absolute_paths(options: Options) -> Options:
+    """The options with absolute paths and sources: workers run elsewhere."""
+    changed: dict[str, str] = {}
+    for name in ("out", "houses", "objects", "scenes_from", "config"):
+        if (value := getattr(options, name, None)) is not None:
+            make = absolute_source if name in ("houses", "objects") else absolute_path
+            changed[name] = make(value)
+    return replace(options, **changed)
+
+
+def words_to_resume(path: str, options: JobOptions, moved: Sources = AS_FOUND) -> list[str]:
+    """The words of the command that resumes a run in the same way; `moved`: new locations of its sources."""
+    where = given_options(JobOptions(workers=options.workers, address=options.address))
+    if jobs_api := os.environ.get(JOBS_API):  # a detached job is detached again
+        where = {"--detach": True, "--address": None if head_token(jobs_api) else jobs_api}
+    sources = {
+        "--houses": moved.houses,
+        "--objects": moved.objects,
+        "--scenes-from": moved.scenes_from,
+    }
+    return ["resume", absolute_path(path), *words_of(sources | where)]
 
 
 def open_job_run(run: Run, given: Sources, address: str) -> JobRun:
@@ -64,68 +74,6 @@ def open_job_run(run: Run, given: Sources, address: str) -> JobRun:
     )
 
 
-def continue_job(
-    words: Sequence[str],
-    path: str,
-    given: Sources,
-    job_options: JobOptions,
-    prepare: Callable[[Sequence[JobRun]], None],
-    planned: Callable[[Sequence[JobRun]], Sequence[PlannedRun]],
-) -> JobResult:
-    """Open the run, or merged runs, at `path`, let `prepare` change them, and make the missing shards.
-
-    A dry run forecasts the shards of `planned` instead.
-
-    `words` are those of the command itself: a detached job runs it again, `prepare` included.
-    """
-    if job_options.detach and job_options.address != "local":
-        return detach_job(words, path, job_options)
-    with opening(words, job_options) as began_s:
-        storage = open_storage(path, probe=not job_options.dry_run, create=False)
-        job_runs = [open_job_run(run, given, job_options.address) for run in open_runs(storage)]
-        if not job_options.dry_run:
-            prepare(job_runs)
-    if job_options.dry_run:
-        return dry_run(path, planned(job_runs), job_options, began_s)
-    if job_options.detach:
-        return detach_job(words, path, job_options)
-    command = [*words, *job_options.address_words()]
-    return start_job(storage, path, job_runs, job_options, began_s, command, given)
-
-
-def planned_run(job_run: JobRun, n: int, quarantined: bool = False) -> PlannedRun:
-    """The shards that a run of n labels lacks; with `quarantined`, also those in quarantine."""
-    run = job_run.run
-    decided = run.committed() if quarantined else run.committed() | run.quarantined()
-    shards = len(ShardRanges.of(range(run.layout.shards_for(n))).without(ShardRanges.of(decided)))
-    sources = job_run.houses, job_run.objects, job_run.scenes_from
-    return PlannedRun(run.manifest, run, n, shards, *sources)
-
-
-def start_job(
-    storage: Storage,
-    path: str,
-    job_runs: Sequence[JobRun],
-    job_options: JobOptions,
-    began_s: float,
-    command: Sequence[str],
-    given: Sources = AS_FOUND,
-    resume: Sequence[str] | None = None,
-) -> JobResult:
-    """Make the missing shards. Raises Interrupted where the job was asked to stop.
-
-    `resume` are the words of the command that resumes, by default `datagen resume`.
-    """
-    words = list(resume or ["resume", absolute_path(path), *source_words(given), *job_options.words()])
-    words += detached_words() or job_options.address_words()
-    with resumable(words):
-        result = run_job(JobPlan(storage, path, job_runs, job_options, began_s, command, words))
-    if result.end == "interrupted":
-        left = counted(result.remaining, "shard")
-        raise Interrupted(f"{left} left. Resume with: {command_line(result.resume)}", result)
-    return result
-
-
 def refuse_unusable_engines(spec: Specification, address: str) -> None:
     """Raise InputError for a robot or a renderer that does not work on this machine."""
     if spec.arm is not None:
@@ -134,7 +82,7 @@ def refuse_unusable_engines(spec: Specification, address: str) -> None:
         device = probe_render_device()
         if not device.succeeded:
             problem, fix = f"finds no render device ({device.text})", "Use embree, or see `datagen doctor`"
-            raise InputError("--renderer", "sapien", problem, fix)
+            raise InputError("observation.renderer", "sapien", problem, fix)
 
 
 def refuse_other_engines(place: str, spec: Specification) -> None:
@@ -152,3 +100,19 @@ def refuse_other_engines(place: str, spec: Specification) -> None:
     if rows:
         fix = "Install the run's versions, or start a new run"
         raise InputError(place, "engines", "; ".join(rows), fix)
+
+
+def absolute_source(ref: str) -> str:
+    """A source reference with its file or folder made absolute."""
+    kind, _, text = ref.partition(":")
+    # Text that is not an existing path is a parameter of the source, as in builtin:400.
+    is_path = bool(text) and kind != "builtin" and Path(text).expanduser().exists()
+    return refuse_not_utf8(f"{kind}:{Path(text).expanduser().resolve()}" if is_path else ref)
+
+
+def absolute_path(path: str | Path) -> str:
+    """A run's absolute path or its address, valid in every folder."""
+    path = str(path)
+    if "://" in path and not path.startswith("file://"):
+        return path
+    return str(Path(path.removeprefix("file://")).expanduser().absolute())

@@ -12,7 +12,6 @@ from datagen.reports.ledger_balance import Balance, balance
 from datagen.reports.paired_runs import AuditedRun, correct_labels, fidelity, pairs
 from datagen.reports.prices import Prices
 from datagen.reports.scene_intervals import METHOD
-from datagen.reports.specification_summary import made_from
 from datagen.reports.spending import account_for
 from datagen.schemas.run import Run
 
@@ -53,7 +52,7 @@ def _source(source: str, group: Sequence[AuditedRun], candidates: str, prices: P
     labelled = join_labelled(read) if read else None
     report = audit_report(spending, source, prices)
     report |= source_costs(spending, [one.cost for one in group], labelled, prices)
-    report["made_from"] = made_from(one.run.manifest for one in group)
+    report["made_from"] = "; ".join(dict.fromkeys(one.run.manifest.made_from for one in group))
     if labelled is not None and labelled.outcome is not None:
         report["outcomes"] = outcome_report(labelled.at(labelled.is_in(candidates)))
     return report

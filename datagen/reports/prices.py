@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from datagen.configuration.specify import read_toml
+from datagen.configuration.toml_files import read_toml
 from datagen.schemas.errors import InputError
 
 DEFAULT_PRICES = Path(__file__).with_name("prices.toml")

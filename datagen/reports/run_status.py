@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from datagen.cluster.retry_policy import RetryPolicy
-from datagen.reports.specification_summary import made_from
+from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.lineage import lineage_summary
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lifted_records
@@ -69,7 +68,7 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
         "run": run.storage.url,
         "label_source": run.manifest.spec.label_source,
         "spec_hash": run.manifest.spec_hash,
-        "made_from": made_from([run.manifest]),
+        "made_from": run.manifest.made_from,
         "scenes_from": run.manifest.sources.get("scenes_from"),
         "created": run.manifest.created,
         "n": n,

@@ -21,7 +21,6 @@ class Stream(IntEnum):
     NOISE = 4
     PATH = 5
     DISTURBANCE = 6
-    FORECAST = 8  # for no sample: draws of the cost of a job
     ARRIVAL = 9  # for no sample: poses at which robots arrive in a closed loop
 
 

@@ -11,10 +11,10 @@ import re
 import secrets
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import psutil
-from pydantic import BaseModel, Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import BaseModel, Field
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, read_record, utc_now
@@ -22,7 +22,7 @@ from datagen.schemas.run_records import FORMAT_VERSION, StoredRecord
 from datagen.schemas.storage import Storage
 
 JobId = Annotated[str, Field(pattern=r"^[0-9]{8}T[0-9]{6}-[0-9a-f]{8}$")]
-JobEnd = Literal["", "complete", "budget", "interrupted", "failed", "aborted", "broken"]
+JobEnd = Literal["", "complete", "interrupted", "failed", "aborted", "broken"]
 Health = Literal["ended", "live", "silent", "dead"]
 SILENT_AFTER = timedelta(minutes=1)
 # A process that began after the job's record was written only reuses its number.
@@ -60,18 +60,12 @@ class JobState(StoredRecord):
     labels: int = Field(default=0, ge=0)
     labels_per_s: float = Field(default=0, ge=0)  # over the last minute; after the end, over the job
     left_s: float | None = None  # None while the rate is not known
-    left_80_s: tuple[float, float] | None = None  # 80 % interval; None while too few shards are made
     retries: int = Field(default=0, ge=0)
     quarantined: int = Field(default=0, ge=0)
     stopping: str = ""  # why no new shard is started
     end: JobEnd = ""
     exit_code: int | None = None
     cause: str = ""
-
-    @model_serializer(mode="wrap")
-    def _without_unknown_interval(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit the interval where it is None: ended jobs then have the fields that older versions read."""
-        return {name: value for name, value in plain(self).items() if name != "left_80_s" or value}
 
 
 class StopRecord(StoredRecord):

@@ -75,6 +75,15 @@ class Manifest(StoredRecord):
     # Addresses and numbers of houses and objects; not part of the run's identity.
     sources: dict[str, str] = Field(default_factory=dict)
 
+    @property
+    def made_from(self) -> str:
+        """Houses, objects and robot: "400 builtin houses (split all), 10 builtin objects, sampled robots"."""
+        spec, known = self.spec, self.sources
+        houses = f"{known.get('n_houses', '')} {spec.houses.kind} houses (split {spec.split})"
+        objects = f"{known.get('n_objects', '')} {spec.objects.kind} objects"
+        robot = f"robot {spec.arm.robot}" if spec.arm else "sampled robots"
+        return ", ".join(part.strip() for part in (houses, objects, robot))
+
     @field_serializer("spec")
     def _as_stored(self, spec: Specification) -> dict[str, Any]:
         """Keeps the fields under the hash when a merge writes the manifest again."""

@@ -138,7 +138,7 @@ def fit_leaving_houses_out(
 
 def refuse_too_little(trials: Trials, place: str) -> None:
     """Raise InputError for labels of one class, few scenes or one house."""
-    fix = "Name more runs, or make more labels with `datagen extend`"
+    fix = "Name more runs, or make more labels with `datagen resume RUN --n N`"
     if not len(trials):
         raise InputError(place, "--candidates", "selects no candidate", "Choose another set")
     if trials.label.all() or not trials.label.any():

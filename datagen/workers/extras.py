@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Iterable
 from dataclasses import dataclass
-from importlib.metadata import Distribution, PackageNotFoundError
+from importlib.metadata import Distribution, PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -90,6 +91,17 @@ def missing_library(error: Exception, preferred: str = "") -> InputError | None:
         return None
     extra = preferred if preferred in found else found[0]
     return InputError(name, "", "is not installed", how_to_get(extra))
+
+
+def versions_of(names: Iterable[str]) -> dict[str, str]:
+    """Installed versions of the names that are distributions; "" where not installed."""
+    found: dict[str, str] = {}
+    for name in names:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = ""
+    return found
 
 
 def _from_origin(extra: str) -> str | None:

@@ -10,10 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.job_totals import JobSummary, JobTotals
-from datagen.cluster.retry_policy import RetryPolicy, ShardFailures
-from datagen.cluster.stop_request import StopRequest
-from datagen.cluster.task import AttemptReport
+from datagen.cluster.protocol import AttemptReport, JobSummary, JobTotals, StopRequest
+from datagen.cluster.shard_policy import RetryPolicy, ShardFailures
 from datagen.schemas.run_records import Commit, Cost, Host
 from datagen.schemas.shard_ranges import ShardRanges
 from tests.cluster.simulated import FakeClock, Heard, PaperRecorder, report_of

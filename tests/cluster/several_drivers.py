@@ -6,10 +6,8 @@ import threading
 from typing import TypeVar
 
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.job_totals import JobSummary
-from datagen.cluster.retry_policy import RetryPolicy
-from datagen.cluster.stop_request import StopRequest
-from datagen.cluster.task import AttemptReport
+from datagen.cluster.protocol import AttemptReport, JobSummary, StopRequest
+from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.shard_ranges import ShardRanges
 from tests.cluster.simulated import FakeClock, Fate, Heard, PaperRecorder, SimulatedExecutor
 

@@ -8,9 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from datagen.cluster.driver import AttemptOrder
-from datagen.cluster.job_totals import JobTotals
-from datagen.cluster.retry_policy import RetryPolicy, ShardFailures
-from datagen.cluster.task import AttemptReport
+from datagen.cluster.protocol import AttemptReport, JobTotals
+from datagen.cluster.shard_policy import RetryPolicy, ShardFailures
 from datagen.schemas.run_records import Commit, Cost, LedgerEntry
 from datagen.schemas.shard_ranges import ShardRanges
 

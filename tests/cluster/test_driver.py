@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.job_totals import JobSummary, JobTotals
-from datagen.cluster.retry_policy import RetryPolicy
-from datagen.cluster.stop_request import StopRequest
+from datagen.cluster.protocol import JobSummary, JobTotals, StopRequest
+from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.errors import InputError
 from datagen.schemas.run_records import Commit, Cost, Host, LedgerEntry
 from tests.cluster.bad_cluster import simulate

@@ -8,15 +8,18 @@ from pathlib import Path
 
 import pytest
 
-from datagen.cluster.attempt_guard import Meter, guarded
+from datagen.cluster.attempt_guard import Meter, Note, failure_report, guarded, read_note
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
-from datagen.cluster.job_totals import JobSummary
-from datagen.cluster.post_mortem import Note, failure_report, read_note
-from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.protocol import (
+    AttemptResult,
+    JobCannotContinue,
+    JobSummary,
+    StopRequest,
+    stop_on_signals,
+)
 from datagen.cluster.run_recorder import RunRecorder
-from datagen.cluster.stop_request import StopRequest, stop_on_signals
-from datagen.cluster.task import AttemptResult, JobCannotContinue
+from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.run import Run
 from tests.cluster.simulated import Heard
 from tests.faults.scripted import ScriptedTask, perform

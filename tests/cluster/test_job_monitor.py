@@ -1,91 +1,159 @@
-"""The job monitor against a simulated cluster: it publishes its status and polls for stop requests."""
+"""A job's display, its published state, and requests to stop it, against a simulated cluster."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+import io
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
 
 import pytest
+from rich.console import Console
 
 from datagen.cluster.driver import drive
-from datagen.cluster.job_progress import JobMonitor, JobStatus, StopMode
-from datagen.cluster.job_totals import JobSummary
-from datagen.cluster.retry_policy import RetryPolicy
-from datagen.cluster.stop_request import StopRequest
-from tests.cluster.simulated import FakeClock, Heard, PaperRecorder, SimulatedExecutor
+from datagen.cluster.job_monitor import JobMonitor, JobProgress, JobRecorder
+from datagen.cluster.protocol import AttemptReport, JobSummary, JobTotals, StopRequest
+from datagen.cluster.shard_policy import RetryPolicy
+from datagen.display.progress import Progress
+from datagen.schemas.jobs import Jobs, JobState, StopRecord
+from datagen.schemas.storage import open_storage
+from tests.cluster.simulated import FakeClock, PaperRecorder, SimulatedExecutor
 
 SHARD_S = 5.0
+Request = Literal["drain", "force"]
+CRASH = AttemptReport("a", 5, "crashed", cause="Fatal Python error: Segmentation fault")
+
+
+class WatchedJobs(Jobs):
+    """Real records, and when they were written and read; the stop request is a function of the time."""
+
+    def __init__(self, folder: Path, clock: FakeClock, requested: Callable[[float], Request | None]) -> None:
+        super().__init__(open_storage(folder))
+        self.clock, self.requested = clock, requested
+        self.states: list[tuple[float, JobState]] = []
+        self.looked_s: list[float] = []
+
+    def put_state(self, state: JobState) -> None:
+        super().put_state(state)
+        self.states.append((self.clock.now_s, state))
+
+    def stop_order(self, job: str) -> StopRecord | None:
+        self.looked_s.append(self.clock.now_s)
+        mode = self.requested(self.clock.now_s)
+        return StopRecord(id=job, now=mode == "force", asked="", host="") if mode else None
 
 
 @dataclass
-class PaperBoard:
-    """Remembers what was published and when; the stop request is a function of the time."""
+class Watched:
+    """A job of 400 shards on four workers, and what was seen of it."""
 
-    clock: FakeClock
-    requested: Callable[[float], StopMode | None] = lambda now_s: None
-    told: list[tuple[float, JobStatus]] = field(default_factory=list)
-    looked_s: list[float] = field(default_factory=list)
+    summary: JobSummary
+    jobs: WatchedJobs
+    closed: dict[str, int]
+    said: Sequence[dict[str, Any]]
+    states: list[tuple[float, JobState]] = field(init=False)
 
-    def publish(self, status: JobStatus) -> None:
-        self.told.append((self.clock.now_s, replace(status, totals=replace(status.totals))))
-
-    def stop_requested(self) -> StopMode | None:
-        self.looked_s.append(self.clock.now_s)
-        return self.requested(self.clock.now_s)
+    def __post_init__(self) -> None:
+        self.states = [(at_s, state) for at_s, state in self.jobs.states if state.phase == "making"]
 
 
-def watched(
-    shards: int,
-    requested: Callable[[float], StopMode | None] = lambda now_s: None,
-    stop: StopRequest | None = None,
-) -> tuple[JobSummary, PaperBoard, PaperRecorder, Heard]:
-    clock, recorder, heard = FakeClock(), PaperRecorder(), Heard()
-    board, stop = PaperBoard(clock, requested), stop or StopRequest()
+def watch(
+    folder: Path, requested: Callable[[float], Request | None] = lambda now_s: None, asked: int = 0
+) -> Watched:
+    clock, out, stop = FakeClock(), io.StringIO(), StopRequest()
+    for _ in range(asked):
+        stop.ask()
+    jobs, books = WatchedJobs(folder, clock, requested), PaperRecorder()
+    recorder = JobRecorder(jobs, ("datagen",), "local", shards=400)
     executor = SimulatedExecutor(clock, lambda o, n: ("committed", SHARD_S), slots=4)
-    events = JobMonitor(board, stop, labels_per_shard=10, shown=heard, clock=clock)
-    summary = drive(range(shards), lambda o: o, executor, recorder, RetryPolicy(), events, stop, clock)
-    return summary, board, recorder, heard
+    with Progress(True, clock, Console(file=out)) as shown:
+        events = JobMonitor(recorder, stop, shown, labels_per_shard=10)
+        summary = drive(range(400), lambda o: o, executor, books, RetryPolicy(), events, stop, clock)
+    said = [json.loads(line) for line in out.getvalue().splitlines()]
+    return Watched(summary, jobs, dict(books.closed), said)
 
 
-def test_it_tells_every_ten_seconds_and_looks_every_three() -> None:
-    summary, board, _, heard = watched(400)
-    assert summary.end == "complete" and len(heard.actions) == 400
-    for times, step_s in (([t for t, _ in board.told], 10), (board.looked_s, 3)):
+def test_state_is_published_every_ten_seconds_and_requests_are_read_every_three(tmp_path: Path) -> None:
+    job = watch(tmp_path)
+    assert job.summary.end == "complete" and {line["event"] for line in job.said} == {"progress"}
+    for times, step_s in (([at_s for at_s, _ in job.states], 10), (job.jobs.looked_s, 3)):
         gaps = [b - a for a, b in pairwise(times)]
         assert min(gaps) >= step_s and max(gaps) <= step_s + 1
-    done = [standing.totals.finished for _, standing in board.told]
+    done = [state.done for _, state in job.states]
     assert done == sorted(done) and done[-1] > 380
-    late = board.told[-1][1]
-    assert late.labels_per_s == pytest.approx(4 * 10 / SHARD_S, rel=0.1)
-    assert late.left_s is not None and late.left_s == pytest.approx((400 - done[-1]) * 10 / late.labels_per_s)
-    assert late.stopping == ""
+    last = job.states[-1][1]
+    assert last.labels_per_s == pytest.approx(4 * 10 / SHARD_S, rel=0.1)
+    assert last.left_s is not None and last.left_s == pytest.approx((400 - done[-1]) * 10 / last.labels_per_s)
+    assert last.stopping == ""
 
 
-def test_a_request_drains_and_is_told_of_at_once() -> None:
-    summary, board, recorder, heard = watched(400, lambda now_s: "drain" if now_s >= 30 else None)
-    assert summary.end == "interrupted" and heard.reasons == ["asked to stop"]
-    assert set(recorder.closed) == {"committed"} and summary.totals.committed < 60
-    told_s = next(t for t, standing in board.told if standing.stopping == "asked to stop")
-    assert 30 <= told_s <= 34
-    assert [s.stopping for _, s in board.told][-1] == "asked to stop"
+def test_a_request_drains_the_job_and_is_published_at_once(tmp_path: Path) -> None:
+    job = watch(tmp_path, lambda now_s: "drain" if now_s >= 30 else None)
+    assert job.summary.end == "interrupted"
+    assert [line["reason"] for line in job.said if line["event"] == "stopping"] == ["asked to stop"]
+    assert set(job.closed) == {"committed"} and job.summary.totals.committed < 60
+    stopping_s = next(at_s for at_s, state in job.states if state.stopping == "asked to stop")
+    assert 30 <= stopping_s <= 34 and job.states[-1][1].stopping == "asked to stop"
 
 
-def test_a_request_to_end_at_once_ends_what_is_in_flight_by_force() -> None:
-    summary, _, recorder, _ = watched(400, lambda now_s: "force" if now_s >= 32 else None)
-    assert summary.end == "interrupted" and recorder.closed["cancelled"] == 8
+@pytest.mark.parametrize("drains_first", [False, True])
+def test_a_request_to_stop_at_once_kills_attempts_in_flight(tmp_path: Path, drains_first: bool) -> None:
+    def requested(now_s: float) -> Request | None:
+        return "force" if now_s >= 33 else "drain" if drains_first and now_s >= 30 else None
+
+    job = watch(tmp_path, requested)
+    assert job.summary.end == "interrupted" and job.closed["cancelled"] > 0
 
 
-def test_force_may_follow_a_drain() -> None:
-    def request(now_s: float) -> StopMode | None:
-        return None if now_s < 30 else "drain" if now_s < 33 else "force"
-
-    summary, _, recorder, _ = watched(400, request)
-    assert summary.end == "interrupted" and recorder.closed["cancelled"] > 0
+def test_a_request_to_drain_after_a_ctrl_c_is_not_a_second_ctrl_c(tmp_path: Path) -> None:
+    job = watch(tmp_path, lambda now_s: "drain", asked=1)
+    assert job.summary.end == "interrupted" and "cancelled" not in job.closed
 
 
-def test_a_drain_after_a_ctrl_c_is_not_the_second_ctrl_c() -> None:
-    stop = StopRequest()
-    stop.ask()
-    summary, _, recorder, _ = watched(400, lambda now_s: "drain", stop)
-    assert summary.end == "interrupted" and not stop.force and recorder.closed["cancelled"] == 0
+def thirty_seconds(as_json: bool) -> list[str]:
+    clock, out = FakeClock(), io.StringIO()
+    shown = Progress(as_json, clock, Console(file=out))
+    events, totals = JobProgress(shown, 60, done_before=50), JobTotals(100)
+    for second in range(1, 31):
+        clock.now_s = second
+        totals.committed, totals.labels = second, 60 * second
+        events.tick(totals)
+    events.ended(CRASH, "retry")
+    events.ended(AttemptReport("b", 6, "committed"), "done")
+    events.stopping("asked to stop")
+    events.tick(totals)
+    shown.close()
+    return out.getvalue().splitlines()
+
+
+def test_json_lines_come_at_intervals_and_for_each_failure() -> None:
+    said = [json.loads(line) for line in thirty_seconds(as_json=True)]
+    assert [s["event"] for s in said] == ["progress"] * 3 + ["attempt_crashed", "stopping", "progress"]
+    assert said[2]["shards_done"] == 80 and said[2]["shards"] == 150
+    assert said[2]["labels_per_s"] == 60.0 and said[2]["left_s"] == 70
+    assert said[3]["shard"] == 5 and said[3]["action"] == "retry"
+
+
+def test_lines_of_text_have_the_same_figures() -> None:
+    assert thirty_seconds(as_json=False)[2:] == [
+        "shards 80/150  60 labels/s  0:01:10 left  0 retries  0.00 core-h",
+        "shard 5 crashed: Fatal Python error: Segmentation fault (retry)",
+        "asked to stop: waiting for running attempts; Ctrl-C again stops at once",
+        "shards 80/150  60 labels/s  0:01:10 left  0 retries  0.00 core-h  stopping",
+    ]
+
+
+def test_a_terminal_of_80_columns_shows_all_figures() -> None:
+    out, clock = io.StringIO(), FakeClock()
+    shown = Progress(clock=clock, console=Console(file=out, force_terminal=True, width=80, color_system=None))
+    bar = JobProgress(shown, 60)
+    clock.now_s = 40.0
+    bar.tick(JobTotals(3000, committed=1400, labels=84_000, retries=3, useful_cpu_s=7200))
+    bar.ended(CRASH, "retry")
+    shown.close()
+    last = [line for line in out.getvalue().splitlines() if "1400/3000" in line][-1]
+    assert "2,100 labels/s  0:00:46 left  3 retries  2.00 core-h" in last
+    assert "\u2026" not in last and "shard 5 crashed: Fatal Python error" in out.getvalue()

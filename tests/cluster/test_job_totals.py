@@ -6,7 +6,7 @@ from functools import reduce
 
 import pytest
 
-from datagen.cluster.job_totals import End, JobSummary, JobTotals, empty_summary
+from datagen.cluster.protocol import End, JobSummary, JobTotals, empty_summary
 
 
 def summary(end: End, cause: str = "", committed: int = 1) -> JobSummary:

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.job_totals import JobSummary
-from datagen.cluster.stop_request import StopRequest
-from datagen.cluster.task import AttemptReport
+from datagen.cluster.protocol import AttemptReport, JobSummary, StopRequest
 from tests.cluster.simulated import (
     LENIENT,
     FakeClock,

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from datagen.cluster.preflight import MachineReport, inspect_machine, refuse_unfit_machines, versions_of
-from datagen.cluster.task import ShardTask
+from datagen.cluster.protocol import ShardTask
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage

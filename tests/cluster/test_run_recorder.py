@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import datagen.cluster.run_recorder
-from datagen.cluster.retry_policy import ShardFailures
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.shard_policy import ShardFailures
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, LedgerEntry
 from datagen.schemas.summaries import index_files, refresh

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.open_shards import OpenShards
-from datagen.cluster.stop_request import StopRequest
+from datagen.cluster.protocol import StopRequest
+from datagen.cluster.shard_policy import OpenShards
 from datagen.schemas.shard_ranges import ShardRanges
 from tests.cluster.several_drivers import drive_together, waste
 from tests.cluster.simulated import LENIENT, FakeClock, Fate, Heard, PaperRecorder, SimulatedExecutor

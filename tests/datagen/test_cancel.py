@@ -1,4 +1,4 @@
-"""`datagen cancel`, `logs` and `status` from another process than the one that works."""
+"""`datagen cancel` and `status` from another process than the one that works."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_job_is_seen_stopped_and_told_of_from_elsewhere(
     (shown,) = json_of(capsys, ["status", str(run)])["jobs"]
     assert (shown["health"], shown["asked_to_stop"], shown["state"]["exit_code"]) == ("ended", "drain", 130)
     capsys.readouterr()
-    assert cli.run(["logs", str(run), "--follow", "--json"]) == 0  # nobody works: it ends by itself
+    assert cli.run(["status", str(run), "--log", "--json"]) == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [e["event"] for e in events] == ["job_began", "stop_asked", "job_ended"]
     assert cli.run(["cancel", str(run)]) == 0
@@ -102,7 +102,7 @@ def test_a_job_that_was_killed_is_dead_and_nobody_waits_for_it(
     assert "dead: its process has ended" in capsys.readouterr().out
     assert cli.run(["cancel", str(run)]) == 0
     assert "none is running" in capsys.readouterr().out
-    assert cli.run(["logs", str(run)]) == 0
+    assert cli.run(["status", str(run), "--log"]) == 0
     assert "is dead: its process has ended" in capsys.readouterr().out
 
 
@@ -148,6 +148,6 @@ def test_a_job_elsewhere_that_is_silent_is_asked_and_not_waited_for(
 def test_what_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     refused(["cancel", str(tmp_path), "--head"], capsys, str(tmp_path), "one of the two")
     refused(["cancel"], capsys, "RUN")
-    for verb in ("cancel", "logs"):
+    for verb in ("cancel", "status"):
         refused([verb, str(tmp_path)], capsys, "not a run")
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""`datagen extend`: longer runs that keep what they have, and merged ones that share what is to come."""
+"""`datagen resume --n`: longer runs keep their shards; the parts of merged runs share the new labels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen import cli
-from datagen.commands.extend import shares
+from datagen.commands.resume import shares
 from datagen.schemas.merged_runs import open_runs
 from tests.refusals import refused
 from tests.small_runs import (
@@ -46,13 +46,13 @@ def test_a_longer_run_keeps_every_byte_and_is_the_one_made_at_once(
 ) -> None:
     run = make_small_run(tmp_path / "run", N)
     before = files_of(run, "shards", "commits", "ledger", "plans")
-    refused(["extend", str(run), "--n", str(N - 1), *HERE], capsys, "--n", "never shrinks", f"Give {N}")
-    refused(["extend", str(run), "--n", "0", *HERE], capsys, "--n")
+    refused(["resume", str(run), "--n", str(N - 1), *HERE], capsys, "--n", "never shrinks", f"Give {N}")
+    refused(["resume", str(run), "--n", "0", *HERE], capsys, "--n")
     assert files_of(run, "shards", "commits", "ledger", "plans") == before
-    assert cli.run(["extend", str(run), "--n", str(LONG_N), *HERE]) == 0
+    assert cli.run(["resume", str(run), "--n", str(LONG_N), *HERE]) == 0
     assert before.items() <= files_of(run, "shards", "commits", "ledger", "plans").items()
     assert_equal_runs(arrays_of(run), arrays_of(make_small_run(tmp_path / "long", LONG_N)))
-    assert cli.run(["extend", str(run), "--n", str(LONG_N), *HERE]) == 0  # again is to resume
+    assert cli.run(["resume", str(run), "--n", str(LONG_N), *HERE]) == 0  # again is to resume
 
 
 def test_a_run_over_stored_scenes_is_not_extended_beyond_them(
@@ -62,9 +62,9 @@ def test_a_run_over_stored_scenes_is_not_extended_beyond_them(
     run = tmp_path / "run"
     again = ["submit", "heuristic", "--scenes-from", str(source), "--out", str(run), *HERE]
     assert cli.run([*again, "--n", str(PER_SCENE)]) == 0
-    refused(["extend", str(run), "--n", str(LONG_N), *HERE], capsys, "--n", "is more than the")
+    refused(["resume", str(run), "--n", str(LONG_N), *HERE], capsys, "--n", "is more than the")
     assert json_of(capsys, ["status", str(run)])["n"] == PER_SCENE
-    assert cli.run(["extend", str(run), "--n", str(N), *HERE]) == 0
+    assert cli.run(["resume", str(run), "--n", str(N), *HERE]) == 0
     np.testing.assert_array_equal(arrays_of(run)["label"], arrays_of(source)["label"])
 
 
@@ -74,7 +74,7 @@ def test_merged_runs_share_what_is_to_come(tmp_path: Path, capsys: pytest.Captur
     place = tmp_path / "merged"
     assert cli.run(["merge", *map(str, runs), "--out", str(place)]) == 0
     total = 2 * N + 3 * PER_SCENE - 3
-    assert cli.run(["extend", str(place), "--n", str(total), *HERE]) == 0
+    assert cli.run(["resume", str(place), "--n", str(total), *HERE]) == 0
     parts = open_runs(place)
     assert [run.n - N for run in parts] == [PER_SCENE, 2 * PER_SCENE - 3]
     report = json_of(capsys, ["status", str(place)])

@@ -19,7 +19,7 @@ import datagen
 from datagen import cli
 from datagen.cluster.attempt import run_attempt
 from datagen.cluster.attempt_guard import Meter
-from datagen.cluster.task import AttemptResult, ShardTask
+from datagen.cluster.protocol import AttemptResult, ShardTask
 from datagen.jobs import job
 from datagen.sources import Registry
 from tests.small_runs import CONFIG, make_small_run

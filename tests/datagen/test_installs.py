@@ -95,7 +95,7 @@ def refused_line(done: Done) -> str:
 
 def test_the_base_keeps_runs_and_names_what_it_lacks(wheel: Path, copied: Path, tmp_path: Path) -> None:
     base, out = Installed(wheel, tmp_path), tmp_path / "out"
-    verbs = ("verify", "audit", "status", "logs", "seal", "unseal", "repair", "gc", "cancel")
+    verbs = ("verify", "audit", "status", "seal", "unseal", "repair", "gc", "cancel")
     works: list[Command] = [
         ["--help"], ["doctor", "--help"], ["assets", "list"], *([verb, copied] for verb in verbs),
         ["merge", copied, "--out", tmp_path / "merged"],
@@ -135,8 +135,8 @@ def test_labels_are_made_and_shown_without_ray_and_torch(wheel: Path, tmp_path: 
         submit_arguments(other, PER_SCENE, workers=1),
         ["resume", run, "--detach"],
         ["submit", "plan", "--n", "48", "--workers", "0", "--out", other],
-        submit_arguments(other, PER_SCENE, "--settler", "pybullet"),
-        submit_arguments(other, PER_SCENE, "--renderer", "pybullet"),
+        submit_arguments(other, PER_SCENE, config="[settle]\nengine = 'pybullet'\n"),
+        submit_arguments(tmp_path / "third", PER_SCENE, config="[observation]\nrenderer = 'pybullet'\n"),
     )
     for done in made:
         assert done.code == 0, done

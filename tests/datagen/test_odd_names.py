@@ -45,7 +45,6 @@ def odd(tmp_path: Path) -> Path:
             )
         ),
         ["resume", ODD],
-        ["extend", ODD, "--n", "9"],
         ["merge", ODD, "--out", "merged"],
         ["merge", "plain", "--out", ODD],
         ["relabel", "plain", "--out", ODD],

@@ -29,7 +29,7 @@ def test_a_run_that_lacks_a_later_field_with_a_default_goes_on(
         (old / key).write_bytes(signed_json(fields))
     Run.open(old).grow(PER_SCENE)
     assert cli.run(["resume", str(old), *HERE]) == 0
-    assert cli.run(["extend", str(old), "--n", str(2 * PER_SCENE), *HERE]) == 0
+    assert cli.run(["resume", str(old), "--n", str(2 * PER_SCENE), *HERE]) == 0
     make_small_run(old, 3 * PER_SCENE)  # the command that began it: the defaults are what it has
     assert cli.run(["verify", str(old), "--deep", "3"]) == 0
     assert cli.run(["merge", str(old), "--out", str(tmp_path / "merged")]) == 0

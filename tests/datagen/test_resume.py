@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 
+import datagen.commands.resume
 import datagen.commands.submit
-import datagen.jobs.start_job
 from datagen import cli
+from datagen.cluster.shard_policy import RetryPolicy
+from datagen.jobs.job import Job, JobOptions, JobRun
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lifted_records
 from datagen.schemas.record_files import encode_record
@@ -30,6 +32,7 @@ from tests.small_runs import (
 )
 
 N = 8 * PER_SCENE  # one scene a shard
+IN_PROCESS = JobOptions(workers=0, quiet=True)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +60,7 @@ def give_up(run: Path, *shards: int) -> None:
         )  # fmt: skip
 
 
-def test_what_is_missing_is_made_and_what_is_there_stays(finished: Path, copied: Path) -> None:
+def test_missing_shards_are_made_and_committed_ones_stay(finished: Path, copied: Path) -> None:
     lose(copied, 1, 6)
     before = files_of(copied, "shards", "commits", "plans")
     assert cli.run(["resume", str(copied), *HERE]) == 0
@@ -102,7 +105,7 @@ def test_another_engine_than_the_run_was_made_with_is_refused(
     refused(["resume", str(copied), *HERE], capsys, "engines", "numpy: the run has 1.0, this machine")
 
 
-def test_shards_that_were_given_up_are_tried_again_only_when_asked(
+def test_quarantined_shards_are_tried_again_only_with_quarantined(
     finished: Path, copied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lose(copied, 2, 5)
@@ -121,16 +124,16 @@ def test_shards_that_were_given_up_are_tried_again_only_when_asked(
     assert cli.run(["verify", str(copied)]) == 0  # the history is no finding
 
 
-def test_the_share_of_the_whole_run_decides_the_exit_code(copied: Path) -> None:
+@pytest.mark.parametrize(("share", "code"), [(0.2, 1), (0.25, 0)])
+def test_the_quarantined_share_of_the_whole_run_decides_the_exit_code(
+    copied: Path, share: float, code: int
+) -> None:
     lose(copied, 2, 5, 7)
     give_up(copied, 2, 5)
-    assert cli.run(["resume", str(copied), "--max-quarantined", "0.2", *HERE]) == 1
-    assert cli.run(["resume", str(copied), "--max-quarantined", "0.25", *HERE]) == 0
-
-
-@pytest.mark.parametrize("share", ["-0.1", "1.5", "nan", "all"])
-def test_what_is_no_share_is_refused(finished: Path, share: str, capsys: pytest.CaptureFixture[str]) -> None:
-    refused(["resume", str(finished), f"--max-quarantined={share}"], capsys, "quarantined")
+    run = Run.open(copied)
+    policy = RetryPolicy(max_quarantined_share=share)
+    job = Job(run.storage, str(copied), [JobRun(run, "builtin", "builtin")], IN_PROCESS, 0.0, policy=policy)
+    assert job.run().exit_code == code
 
 
 def interrupting(*arguments: object) -> None:
@@ -138,28 +141,46 @@ def interrupting(*arguments: object) -> None:
 
 
 def the_command(capture: pytest.CaptureFixture[str], call: Callable[[], int]) -> list[str]:
-    """The command that an interrupted one says to go on with."""
+    """The command that an interrupted one says to resume with."""
     capture.readouterr()
     assert call() == 130
     (line,) = [x for x in capture.readouterr().err.splitlines() if x.strip().startswith("datagen ")]
     return shlex.split(line)[1:]
 
 
-def test_an_early_ctrl_c_says_how_to_go_on(
+def test_an_early_ctrl_c_says_how_to_resume(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"
-    with monkeypatch.context() as patched:  # while the first scene is drawn
+    with monkeypatch.context() as patched:  # while the first scene is made: nothing is written
         patched.setattr(datagen.commands.submit, "generate_scene", interrupting)
-        again = the_command(capsys, lambda: cli.run(submit_arguments(run, N)))
-    assert again[:2] == ["submit", "heuristic"] and not run.exists()
-    with monkeypatch.context() as patched:  # while workers start: the run is there
+        assert cli.run(submit_arguments(run, N)) == 130 and not run.exists()
+    with monkeypatch.context() as patched:  # while workers start: the run exists
         patched.setattr("datagen.jobs.job.InProcessExecutor", interrupting)
-        assert the_command(capsys, lambda: cli.run(again))[:2] == ["resume", str(run)]
+        again = the_command(capsys, lambda: cli.run(submit_arguments(run, N)))
+    assert again == ["resume", str(run), *HERE]
     with monkeypatch.context() as patched:  # while sources are opened
-        patched.setattr(datagen.jobs.start_job, "open_sources", interrupting)
-        again = the_command(capsys, lambda: cli.run(["resume", str(run), *HERE]))
+        patched.setattr(datagen.commands.resume, "open_job_run", interrupting)
+        assert the_command(capsys, lambda: cli.run(["resume", str(run), *HERE])) == again
     jobs = json_of(capsys, ["status", str(run)])["jobs"]
     assert [job["state"]["end"] for job in jobs] == ["interrupted"]
     assert cli.run(again) == 0
     assert_equal_runs(arrays_of(run), arrays_of(finished))
+
+
+def test_a_dry_run_checks_everything_and_writes_nothing(
+    finished: Path, copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lose(copied, 2)
+    before = files_of(copied)
+    dry = json_of(capsys, [*submit_arguments(copied, 2 * N), "--dry-run"])
+    assert (dry["shards"], dry["scenes"], dry["n"]) == (9, 9, 2 * N)
+    assert files_of(copied) == before
+    new = submit_arguments(tmp_path / "new", N)
+    assert cli.run([*new, "--dry-run"]) == 0
+    command = capsys.readouterr().out.splitlines()[-1]
+    assert not (tmp_path / "new").exists()
+    refused([*submit_arguments(copied, N, "--seed", "5"), "--dry-run"], capsys, "seed: 0, but 5 was given")
+    refused([*new, "--dry-run", "--detach"], capsys, "--dry-run", "Omit one of them")
+    assert cli.run(shlex.split(command)[1:]) == 0  # the printed command makes the run
+    assert_equal_runs(arrays_of(tmp_path / "new"), arrays_of(finished))

@@ -50,12 +50,12 @@ def test_a_run_on_s3_is_resumed_extended_and_told_of(
     assert cli.run(["resume", run, *HERE]) == 1
     assert f"datagen resume {run} --quarantined" in " ".join(capsys.readouterr().out.split())
     assert cli.run(["resume", run, "--quarantined", *HERE]) == 0
-    assert cli.run(["extend", run, "--n", str(N + PER_SCENE), *HERE]) == 0
+    assert cli.run(["resume", run, "--n", str(N + PER_SCENE), *HERE]) == 0
     report = json_of(capsys, ["status", run])
     assert report["complete"] and report["sealed"] and report["taken_out_of_quarantine"] == 1
     ends = [job["state"]["end"] for job in report["jobs"]]
     assert ends == ["interrupted", "complete", "complete", "complete"]
-    assert cli.run(["logs", run]) == 0
+    assert cli.run(["status", run, "--log"]) == 0
     assert "tried again later" in capsys.readouterr().out
     here = make_small_run(tmp_path / "run", N + PER_SCENE)
     assert digests_of(Run.open(run)) == digests_of(Run.open(here))

@@ -23,7 +23,6 @@ from datagen.schemas.fields import sized_schema
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import QuarantineRecord
 from tests.refusals import refused
-from tests.sim_extra import needs_pybullet
 from tests.small_runs import (
     PER_SCENE,
     arrays_of,
@@ -122,10 +121,7 @@ def test_a_larger_n_extends_and_shard_size_changes_no_array(copied: Path, finish
     ("more", "fields"),
     [
         (["--seed", "5"], ["seed: 0, but 5 was given"]),
-        pytest.param(
-            ["--settler", "pybullet"], ["settle.engine", "sapien", "pybullet"], marks=needs_pybullet
-        ),
-        (["--split", "val", "--robots-per-scene", "2"], ["split", "'all'", "'val'", "robots_per_scene"]),
+        (["--split", "val", "--candidates", "clear"], ["split", "'all'", "'val'", "candidates.within"]),
         (["--candidates-per-scene", "9"], ["candidates_per_scene", "8", "9"]),
     ],
 )

@@ -18,11 +18,9 @@ from typing import Any
 
 from datagen.cluster.attempt_guard import Meter, this_host
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.open_shards import OpenShards
-from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.protocol import AttemptResult, StopRequest
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
-from datagen.cluster.stop_request import StopRequest
-from datagen.cluster.task import AttemptResult
+from datagen.cluster.shard_policy import OpenShards, RetryPolicy
 from datagen.reports.spending import account_for
 from datagen.schemas.cost import StageClock
 from datagen.schemas.keys import commit_key

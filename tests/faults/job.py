@@ -13,16 +13,14 @@ import time
 from dataclasses import dataclass
 
 from datagen.cluster import ray_nodes
-from datagen.cluster.attempt_guard import Meter
+from datagen.cluster.attempt_guard import Meter, notes_of_a_job
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.job_progress import JobProgress
-from datagen.cluster.post_mortem import notes_of_a_job
+from datagen.cluster.job_monitor import JobProgress
+from datagen.cluster.protocol import AttemptResult, StopRequest, stop_on_signals
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import ray_executor
-from datagen.cluster.retry_policy import RetryPolicy
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
-from datagen.cluster.stop_request import StopRequest, stop_on_signals
-from datagen.cluster.task import AttemptResult
+from datagen.cluster.shard_policy import RetryPolicy
 from datagen.display.progress import Progress
 from datagen.schemas.run import Run
 from tests.made_runs import write

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, TypeVar
 
-from datagen.cluster.attempt_guard import Meter, guarded
-from datagen.cluster.post_mortem import failure_report, read_note
-from datagen.cluster.task import AttemptReport, AttemptResult, Task
+from datagen.cluster.attempt_guard import Meter, failure_report, guarded, read_note
+from datagen.cluster.protocol import AttemptReport, AttemptResult, Task
 
 T = TypeVar("T", bound=Task)
 # Forked from a driver that has one thread and has loaded everything: a new worker takes milliseconds. (A

@@ -14,10 +14,9 @@ from zarr.storage import ObjectStore
 from datagen.cluster.attempt_guard import Meter
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
-from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.protocol import AttemptResult, StopRequest
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
-from datagen.cluster.stop_request import StopRequest
-from datagen.cluster.task import AttemptResult
+from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import commit_copy_key, shard_folder
 from datagen.schemas.run import Run

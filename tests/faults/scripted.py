@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from datagen.cluster.attempt_guard import Meter
-from datagen.cluster.task import AttemptResult, JobCannotContinue
+from datagen.cluster.protocol import AttemptResult, JobCannotContinue
 from datagen.schemas.fields import sized_schema
 from datagen.schemas.run_records import Layout
 from tests.made_runs import small_spec, tables_of

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import psutil
 
+from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.job_totals import JobSummary, JobTotals
-from datagen.cluster.post_mortem import notes_of_a_job
+from datagen.cluster.protocol import JobSummary, JobTotals, StopRequest
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import ray_executor
-from datagen.cluster.retry_policy import RetryPolicy
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
-from datagen.cluster.stop_request import StopRequest
+from datagen.cluster.shard_policy import RetryPolicy
 from datagen.reports.spending import account_for
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal

@@ -13,11 +13,10 @@ from typing import Any
 import pytest
 
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.job_totals import JobSummary, JobTotals
+from datagen.cluster.protocol import JobSummary, JobTotals, StopRequest
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
-from datagen.cluster.retry_policy import RetryPolicy
-from datagen.cluster.stop_request import StopRequest
+from datagen.cluster.shard_policy import RetryPolicy
 from tests.cluster.simulated import Heard, PaperRecorder
 from tests.faults.scripted import ScriptedTask, perform
 

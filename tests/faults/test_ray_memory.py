@@ -8,13 +8,12 @@ from pathlib import Path
 import psutil
 import pytest
 
+from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.job_totals import JobSummary
-from datagen.cluster.post_mortem import notes_of_a_job
+from datagen.cluster.protocol import JobSummary, StopRequest
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
-from datagen.cluster.retry_policy import RetryPolicy
-from datagen.cluster.stop_request import StopRequest
+from datagen.cluster.shard_policy import RetryPolicy
 from tests.cluster.simulated import Heard, PaperRecorder
 from tests.faults.scripted import FILL_BYTES, ScriptedTask, perform
 

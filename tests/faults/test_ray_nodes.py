@@ -9,17 +9,15 @@ from typing import Any
 
 import pytest
 
+from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.job_totals import JobTotals
-from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.preflight import refuse_unfit_machines
+from datagen.cluster.protocol import JobTotals, ShardTask, StopRequest
 from datagen.cluster.ray_cluster import RaySettings, forget_former_token, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
 from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, head_environment, new_token
-from datagen.cluster.retry_policy import RetryPolicy
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
-from datagen.cluster.stop_request import StopRequest
-from datagen.cluster.task import ShardTask
+from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from tests.cluster.simulated import Heard, PaperRecorder

@@ -10,11 +10,11 @@ import pytest
 
 from datagen import cli
 from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.protocol import StopRequest
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
-from datagen.cluster.retry_policy import RetryPolicy
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
-from datagen.cluster.stop_request import StopRequest
+from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.run import Run
 from tests.cluster.simulated import Heard
 from tests.faults.trials import FaultyTrials, attempt_with_faults

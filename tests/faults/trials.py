@@ -9,7 +9,7 @@ from typing import Any
 import datagen.workers.labels.arm_labelling as label_trials
 from datagen.cluster.attempt import run_attempt
 from datagen.cluster.attempt_guard import Meter
-from datagen.cluster.task import AttemptResult, ShardTask
+from datagen.cluster.protocol import AttemptResult, ShardTask
 from tests.faults.scripted import misbehave
 
 

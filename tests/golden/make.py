@@ -78,7 +78,7 @@ def make() -> None:
     run, other, merged = (str(PLACE / name) for name in ("run", "other", "merged"))
     for command in (
         ["submit", "heuristic", "--n", str(PER_SCENE), "--out", run, *given],
-        ["extend", run, "--n", str(N), "--workers", "0"],
+        ["resume", run, "--n", str(N), "--workers", "0"],
         ["submit", "heuristic", "--n", str(PER_SCENE), "--seed", "1", "--out", other, *given],
         ["merge", run, other, "--out", merged],
     ):

@@ -118,7 +118,7 @@ def check_plans(run: Run) -> tuple[int, list[Finding]]:
             if name.isascii() and name.isdigit() and len(name) < 10 and f"{folder}/{name}.json" == file.key:
                 numbers.add(int(name))
     n = 0
-    fix = "Restore the file from a backup, or set the number again with `datagen extend`"
+    fix = "Restore the file from a backup, or set the number again with `datagen resume RUN --n N`"
     if max(numbers) > 10 * len(numbers) + 1000:
         problem = f"plan {max(numbers)} among {len(numbers)} files"
         return 0, [Finding("plans", "record", problem, "Move it out of the run")]

@@ -175,5 +175,5 @@ def _plan(runs: Sequence[Run]) -> Plan:
     plans = [plan for run in runs if (plan := run.plan()) is not None]
     if not plans:
         problem = "has no plan with the number of samples wanted"
-        raise InputError(runs[0].storage.url, "plans", problem, "Set it with `datagen extend`")
+        raise InputError(runs[0].storage.url, "plans", problem, "Set it with `datagen resume RUN --n N`")
     return min(plans, key=lambda plan: (-plan.n, plan.created))

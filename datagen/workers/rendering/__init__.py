@@ -83,4 +83,4 @@ RENDERERS: dict[str, str] = {
 
 def load_renderer(name: str) -> Renderer:
     """The renderer of that name. Raises InputError where it is unknown or cannot be imported."""
-    return entry(RENDERERS, name, "--renderer")
+    return entry(RENDERERS, name, "observation.renderer")

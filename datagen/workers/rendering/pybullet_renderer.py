@@ -40,7 +40,7 @@ class Drawing:
         self._world: int = pybullet.connect(pybullet.DIRECT)
         if self._world < 0:
             fix = "Render fewer scenes at once in one process, or use another renderer"
-            raise InputError("--renderer", "pybullet", "Bullet cannot open another world", fix)
+            raise InputError("observation.renderer", "pybullet", "Bullet cannot open another world", fix)
         self._label_of_body: list[int] = []
 
     def __enter__(self) -> Drawing:

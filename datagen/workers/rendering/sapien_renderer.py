@@ -61,11 +61,11 @@ def _the_studio() -> _Studio:
             system = render.RenderSystem()
         except RuntimeError as error:
             raise InputError(
-                "--renderer",
+                "observation.renderer",
                 "sapien",
                 f"finds no render device ({error})",
                 "See `datagen doctor`: install a GPU driver or Mesa 25 or newer with lavapipe, "
-                "or use --renderer embree",
+                "or choose embree",
             ) from error
         scene = sapien.Scene([system])
         scene.set_ambient_light(_AMBIENT)

@@ -50,7 +50,7 @@ SETTLERS: dict[str, str] = {
 
 def load_settler(name: str) -> Settler:
     """The settler of that name. Raises InputError where it is unknown or cannot be imported."""
-    settler: Settler = entry(SETTLERS, name, "--settler")
+    settler: Settler = entry(SETTLERS, name, "settle.engine")
     return settler
 
 
@@ -59,4 +59,4 @@ def first_settler() -> str:
     for name in SETTLERS:
         if can_import(SETTLERS, name):
             return name
-    raise InputError("--settler", "", "none can be imported here", "Run `datagen doctor`")
+    raise InputError("settle.engine", "", "none can be imported here", "Run `datagen doctor`")

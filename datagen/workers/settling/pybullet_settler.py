@@ -37,7 +37,7 @@ def settle_pybullet(
     world = pybullet.connect(pybullet.DIRECT)
     if world < 0:
         fix = "Run fewer scenes at once in one process, or use another settler"
-        raise InputError("--settler", "pybullet", "Bullet cannot open another physics world", fix)
+        raise InputError("settle.engine", "pybullet", "Bullet cannot open another physics world", fix)
     try:
         with tempfile.TemporaryDirectory(prefix="datagen-bullet-") as folder:
             bodies, T_object_inertial = _fill(

@@ -7,16 +7,15 @@ import runpy
 import shlex
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from datagen import cli
-from datagen.benchmark import make_runs
 from datagen.benchmark.definition import read_benchmark
 from datagen.benchmark.frozen_runs import digests_of
 from datagen.cli import build_app
 from datagen.console.command_lines import Interrupted
+from datagen.jobs.job import Job
 from datagen.jobs.job_report import JobResult
 from tests.conftest import REPOSITORY
 from tests.sim_extra import needs_sim
@@ -47,10 +46,12 @@ def test_the_runs_are_made_again_bit_for_bit(
 def test_an_interrupted_command_says_how_to_resume_itself(
     small_benchmark: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def stopped(*_: Any, resume: list[str], **more: Any) -> JobResult:
-        raise Interrupted("1 shard left", JobResult("x", "interrupted", remaining=1, resume=tuple(resume)))
+    def stopped(job: Job) -> JobResult:
+        raise Interrupted(
+            "1 shard left", JobResult("x", "interrupted", remaining=1, resume=tuple(job.resume))
+        )
 
-    monkeypatch.setattr(make_runs, "start_job", stopped)
+    monkeypatch.setattr(Job, "run", stopped)
     assert made(small_benchmark, tmp_path / "out", "--run", "test") == 130
     told = capsys.readouterr().err
     assert "interrupted; 1 shard left. Resume with:\n  datagen benchmark make --houses builtin" in told

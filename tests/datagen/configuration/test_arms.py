@@ -9,17 +9,18 @@ from typing import Any
 import pytest
 
 from datagen import cli
-from datagen.configuration import arms
-from datagen.configuration.arms import (
+from datagen.configuration import specify as arms
+from datagen.configuration.specify import (
     REACH_STEP_M,
     complete_arm,
+    layout_of,
+    manifest_of,
     narrow_candidates,
     refuse_missing_packages,
     refuse_unsuited,
     robot_of,
+    specify,
 )
-from datagen.configuration.manifest import manifest_of
-from datagen.configuration.specify import layout_of, specify
 from datagen.configuration.stored_scenes import open_stored_scenes, specify_again
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run

@@ -12,7 +12,6 @@ from datagen import cli
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import QuarantineRecord
 from tests.refusals import refused
-from tests.sim_extra import needs_pybullet
 from tests.small_runs import CONFIG, PER_SCENE, arrays_of, files_of, json_of, make_small_run
 from tests.workers.objects.toy_set import write_bundle
 
@@ -120,10 +119,6 @@ def test_more_than_the_source_has_is_refused_with_how_many_there_are(
         ("--split", "val"),
         ("--candidates", "clear"),
         ("--candidates-per-scene", "9"),
-        ("--robots-per-scene", "2"),
-        pytest.param(("--settler", "pybullet"), marks=needs_pybullet),
-        pytest.param(("--renderer", "pybullet"), marks=needs_pybullet),
-        ("--noise",),
     ],
 )
 def test_what_decides_scenes_is_refused_beside_it(

@@ -59,11 +59,9 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 VERBS = [
-    ["logs", "{run}"],
-    ["logs", "{run}", "--stacks"],
-    ["logs", "{run}", "--stacks", "--shard", "1"],
-    ["logs", "{run}", "--stacks", "--json"],
-    ["logs", "{run}", "--driver"],
+    ["status", "{run}", "--log"],
+    ["status", "{run}", "--log", "--stacks"],
+    ["status", "{run}", "--log", "--stacks", "--json"],
     ["status", "{run}"],
     ["status", "{run}", "--stacks"],
     ["status", "{run}", "--json"],
@@ -76,7 +74,7 @@ VERBS = [
     ["replay", "{run}", "--shard", "1"],
     ["merge", "{run}", "--out", "{out}"],
     ["resume", "{run}", "--workers", "0"],
-    ["extend", "{run}", "--n", "60", "--workers", "0"],
+    ["resume", "{run}", "--n", "60", "--workers", "0"],
 ]
 
 
@@ -89,7 +87,7 @@ def test_no_verb_prints_what_a_terminal_acts_on(
     for text in (told.out, told.err):
         assert all(c.isprintable() or c == "\n" for c in text), [c for c in text if not c.isprintable()]
     assert "Traceback" not in told.err
-    if words[0] in ("logs", "status") and words[-1] not in ("--json", "--driver"):
+    if words[0] == "status" and words[-1] != "--json":
         assert "\\x1b]52;c" in told.out and "[red]told" in "".join(told.out.split())
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from datagen import cli
 from datagen.cluster.ray_head import running_head
+from datagen.cluster.ray_jobs import open_ray_jobs
 from datagen.schemas.jobs import Jobs
 from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage
@@ -27,7 +28,7 @@ def test_a_detached_job_outlives_its_shell_and_is_followed_from_another(
 ) -> None:
     run, shell, out = detached.run, detached.shell, detached.out
     told = "".join(out.split())  # a long path is broken into lines
-    assert f"datagenlogs{run}--follow" in told and "datagencancel" in told
+    assert f"datagenstatus{run}" in told and "datagencancel" in told
     try:
         os.killpg(shell.pid, signal.SIGKILL)
     except ProcessLookupError:
@@ -56,28 +57,20 @@ def test_a_detached_job_outlives_its_shell_and_is_followed_from_another(
     assert record.submission in out and record.jobs_api == head.jobs_api and record.pid != shell.pid
     report = json_of(capsys, ["status", str(run)])
     assert report["complete"] and report["sealed"] and report["jobs"][0]["state"]["exit_code"] == 0
-    assert cli.run(["logs", str(run), "--driver"]) == 0
-    assert f"complete: {run}" in capsys.readouterr().out.replace("\n", "")
     assert_equal_runs(arrays_of(run), arrays_of(make_small_run(tmp_path / "here", N)))
 
     # The same head takes the next one, which another shell stops.
-    assert cli.run(["extend", str(run), "--n", str(160 * N), "--workers", "1", "--detach"]) == 0
+    assert cli.run(["resume", str(run), "--n", str(160 * N), "--workers", "1", "--detach"]) == 0
     capsys.readouterr()
-    assert running_head() == head
+    assert running_head() == head and Run.open(run).n == 160 * N
     while len(jobs.all()) < 2:
         time.sleep(0.1)
-    refused(["cancel", "--head"], capsys, "1 job running", "extend")
+    refused(["cancel", "--head"], capsys, "1 job running", "resume")
     assert cli.run(["cancel", str(run), "--now"]) == 0
-    told = capsys.readouterr().out
-    assert "ended interrupted" in told
-    resume = next(r for r in _driver_lines(run, capsys) if r.strip().startswith("datagen resume"))
-    assert resume.split()[-1] == "--detach"
-    assert Run.open(run).n == 160 * N
-
-
-def _driver_lines(run: Path, capture: pytest.CaptureFixture[str]) -> list[str]:
-    assert cli.run(["logs", str(run), "--driver", "--follow"]) == 0
-    return capture.readouterr().out.splitlines()
+    assert "ended interrupted" in capsys.readouterr().out
+    output = open_ray_jobs(head.jobs_api, head.token).output(jobs.all()[1].record.submission)
+    resume = next(line for line in output.splitlines() if line.strip().startswith("datagen resume"))
+    assert resume.split() == ["datagen", "resume", str(run), "--detach"]
 
 
 def _group_of(process: psutil.Process) -> int:

@@ -68,6 +68,6 @@ def test_without_a_render_device_the_error_names_the_fix() -> None:
         timeout=600,
         check=True,
     )
-    assert done.stdout.startswith("--renderer: sapien: finds no render device")
-    assert "datagen doctor" in done.stdout and "--renderer embree" in done.stdout
+    assert done.stdout.startswith("observation.renderer: sapien: finds no render device")
+    assert "datagen doctor" in done.stdout and "choose embree" in done.stdout
     assert done.stdout.count("\n") == 1

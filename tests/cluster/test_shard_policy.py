@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.cluster.retry_policy import (
+from datagen.cluster.protocol import AttemptReport
+from datagen.cluster.shard_policy import (
     Durations,
     RetryPolicy,
     ShardFailures,
@@ -21,7 +22,6 @@ from datagen.cluster.retry_policy import (
     too_many_quarantined,
     window,
 )
-from datagen.cluster.task import AttemptReport
 from datagen.schemas.run_records import Outcome
 
 POLICY = RetryPolicy()

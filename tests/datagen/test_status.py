@@ -1,4 +1,4 @@
-"""`datagen logs` and `datagen status` of runs in which much went wrong."""
+"""`datagen status`, with and without --log, of runs with many failures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from datagen.schemas.quarantine import lift_quarantine
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import LedgerEntry, Outcome, QuarantineRecord
 from tests.made_runs import make_run
-from tests.refusals import refused
 from tests.small_runs import json_of
 
 SEGFAULT = "Fatal Python error: Segmentation fault"
@@ -54,11 +53,11 @@ def troubled(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def lines_of(capture: pytest.CaptureFixture[str], *arguments: str) -> list[Any]:
     capture.readouterr()
-    assert cli.run(["logs", *arguments, "--json"]) == 0
+    assert cli.run(["status", *arguments, "--log", "--json"]) == 0
     return [json.loads(line) for line in capture.readouterr().out.splitlines()]
 
 
-def test_failures_and_retries_are_told_in_order_of_time(
+def test_log_lists_failures_and_retries_in_order_of_time(
     troubled: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     events = lines_of(capsys, str(troubled))
@@ -77,7 +76,7 @@ def test_failures_and_retries_are_told_in_order_of_time(
     assert "Segmentation fault" in events[1]["text"] and "stack" not in events[1]
 
 
-def test_an_attempt_that_no_worker_came_to_has_no_begin(
+def test_an_attempt_that_no_worker_began_has_no_begin(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = make_run(tmp_path / "run", n=20, shards=[0])
@@ -91,19 +90,15 @@ def test_an_attempt_that_no_worker_came_to_has_no_begin(
     assert event["event"] == "attempt_cancelled" and event["at"] == at(3)
 
 
-def test_stacks_and_one_shard(troubled: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    events = lines_of(capsys, str(troubled), "--stacks", "--shard", "1")
-    assert {e["shard"] for e in events} == {1} and len(events) == 5
+def test_log_has_stacks_when_asked(troubled: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    events = lines_of(capsys, str(troubled), "--stacks")
     assert [e["event"] for e in events if "stack" in e] == ["attempt_crashed"]
-    fine = lines_of(capsys, str(troubled), "--shard", "2")
-    assert [e["event"] for e in fine if e["event"] != "attempt_begins"] == ["attempt_committed"]
-    refused(["logs", str(troubled), "--shard", "77"], capsys, "--shard", "77 is not in this run", "0 to 4")
-    assert cli.run(["logs", str(troubled), "--stacks"]) == 0
+    assert cli.run(["status", str(troubled), "--log", "--stacks"]) == 0
     told = capsys.readouterr().out
     assert "    Current thread" in told and "2026-01-01 00:03:00.000  shard 1 crashed" in told
 
 
-def test_status_tells_budgets_stacks_and_quarantine(
+def test_status_lists_failures_stacks_and_quarantine(
     troubled: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     report = json_of(capsys, ["status", str(troubled), "--stacks"])
@@ -123,17 +118,14 @@ def test_status_tells_budgets_stacks_and_quarantine(
         assert words in told
 
 
-def test_silence_is_told_from_a_run_of_which_nothing_is_to_be_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_log_of_a_run_without_events_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = make_run(tmp_path / "run", n=20, shards=[0])
-    for more, words in (((), "no attempt has failed"), (("--shard", "1"), "the shard has not begun")):
-        assert cli.run(["logs", run.storage.url, *more]) == 0
-        told = capsys.readouterr()
-        assert told.out == "" and words in told.err and len(told.err.splitlines()) == 1
+    assert cli.run(["status", run.storage.url, "--log"]) == 0
+    told = capsys.readouterr()
+    assert told.out == "" and "no attempt has failed" in told.err and len(told.err.splitlines()) == 1
 
 
-def test_a_lifted_quarantine_stays_in_the_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_lifted_quarantine_stays_in_the_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = make_run(tmp_path / "run", n=20, shards=[0])
     run.quarantine(
         QuarantineRecord(
@@ -144,4 +136,3 @@ def test_a_lifted_quarantine_stays_in_the_logs(tmp_path: Path, capsys: pytest.Ca
     assert lift_quarantine(run) == [1]
     (event,) = lines_of(capsys, run.storage.url)
     assert event["event"] == "quarantined" and "tried again later" in event["text"]
-    refused(["logs", run.storage.url, "--driver"], capsys, "detached")

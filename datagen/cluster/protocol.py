@@ -1,0 +1,235 @@
+"""What driver, executors and workers exchange: tasks, reports, totals, and requests to stop."""
+
+from __future__ import annotations
+
+import signal
+from collections import Counter
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
+from threading import current_thread, main_thread
+from types import FrameType
+from typing import Literal, Protocol, TypeVar, get_args
+
+from datagen.schemas.run_records import Cost, Host, Layout, Outcome
+from datagen.schemas.specification import Specification
+
+T_contra = TypeVar("T_contra", contravariant=True)
+End = Literal["complete", "failed", "interrupted", "aborted"]  # each worse than the one before
+EXIT_CODES = {"failed": 1, "aborted": 2, "interrupted": 130}  # of the command line; 0 for other ends
+_NAMED = 20  # quarantined shards that the totals list by number
+
+
+class Task(Protocol):
+    """The interface of tasks for executors and the guard.
+
+    `attempt` is a file name, unique over all drivers of the run. `notes` is the folder, within the machine's
+    temporary folder, for the worker's process id and stack, unique to the job; "" for none. An absolute path
+    is used as it is.
+    """
+
+    @property
+    def shard(self) -> int: ...
+    @property
+    def attempt(self) -> str: ...
+    @property
+    def deadline_s(self) -> float: ...
+    @property
+    def notes(self) -> str: ...
+
+
+@dataclass(frozen=True)
+class ShardTask:
+    """One attempt of one shard. Equal tasks give equal arrays on every machine."""
+
+    run: str  # folder or URL of the run
+    spec: Specification
+    layout: Layout
+    shard: int
+    attempt: str
+    houses: str  # source reference as on the command line: `builtin`, `procthor:DIR`
+    objects: str
+    deadline_s: float
+    notes: str = ""
+    scenes_from: str = ""  # folder or URL of the run whose scenes are labelled again; "" for new scenes
+
+    @property
+    def scene_indices(self) -> range:
+        first = self.shard * self.layout.scenes_per_shard
+        return range(first, first + self.layout.scenes_per_shard)
+
+
+@dataclass(frozen=True)
+class AttemptResult:
+    """Result of a task function that reached its commit."""
+
+    won: bool  # False where another attempt was committed before
+    labels: int
+    positives: int
+    cost: Cost
+
+
+@dataclass(frozen=True)
+class AttemptReport:
+    """How one attempt ended. Executors make it for dead workers."""
+
+    attempt: str
+    shard: int
+    outcome: Outcome
+    cause: str = ""  # one line
+    stack: str = ""
+    started: str = ""  # UTC, ISO 8601; "" when it never began
+    ended: str = ""
+    labels: int = 0
+    positives: int = 0
+    cost: Cost | None = None
+    host: Host | None = None
+    # The job cannot continue: every attempt would fail (full disk, sources missing).
+    ends_job: bool = False
+
+
+class Executor(Protocol[T_contra]):
+    """Runs attempts. Every submitted attempt gives one report, whatever happens to it.
+
+    `slots`: attempts that can run at the same time now. `wait` returns reports of ended attempts, as soon as
+    there is one, or none after the timeout. The report of a killed attempt has outcome `cancelled`.
+    """
+
+    @property
+    def slots(self) -> int: ...
+    def submit(self, task: T_contra, /) -> None: ...
+    def wait(self, timeout_s: float, /) -> list[AttemptReport]: ...
+    def has_begun(self, attempt: str, /) -> bool: ...
+    def kill(self, attempt: str, /) -> None: ...
+
+
+class JobCannotContinue(Exception):
+    """Raised by a task function for an error that no retry can fix. Its text is one line with the fix."""
+
+
+@dataclass
+class JobTotals:
+    """Counts since this driver began. Seconds are sums over attempts."""
+
+    shards: int  # of this job, without those done before
+    committed: int = 0
+    superseded: int = 0  # shards that another driver or an earlier attempt had committed
+    elsewhere: int = 0  # shards that another driver had committed before an attempt began here
+    quarantined: int = 0
+    quarantined_shards: list[int] = field(default_factory=list)  # the first few
+    retries: int = 0
+    in_flight: int = 0
+    outcomes: Counter[Outcome] = field(default_factory=Counter)  # attempts by how they ended
+    labels: int = 0
+    positives: int = 0
+    useful_wall_s: float = 0.0
+    useful_cpu_s: float = 0.0
+    wasted_wall_s: float = 0.0
+    wasted_cpu_s: float = 0.0
+
+    @property
+    def finished(self) -> int:
+        """Shards that need no further attempt."""
+        return self.committed + self.superseded + self.elsewhere + self.quarantined
+
+    def count(self, report: AttemptReport) -> None:
+        self.outcomes[report.outcome] += 1
+        wall_s, cpu_s = (report.cost.wall_s, report.cost.cpu_s) if report.cost else (0.0, 0.0)
+        if report.outcome == "committed":
+            self.committed += 1
+            self.labels += report.labels
+            self.positives += report.positives
+            self.useful_wall_s += wall_s
+            self.useful_cpu_s += cpu_s
+        else:
+            self.superseded += report.outcome == "superseded"
+            self.wasted_wall_s += wall_s
+            self.wasted_cpu_s += cpu_s
+
+    def count_quarantined(self, shard: int) -> None:
+        self.quarantined += 1
+        if len(self.quarantined_shards) < _NAMED:
+            self.quarantined_shards.append(shard)
+
+    def plus(self, other: JobTotals) -> JobTotals:
+        sums = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(JobTotals)}
+        sums["quarantined_shards"] = sums["quarantined_shards"][:_NAMED]
+        return JobTotals(**sums)
+
+
+@dataclass(frozen=True)
+class JobSummary:
+    """How a job ended.
+
+    complete: every shard is committed or, within the allowed share, quarantined. interrupted: by a stop
+    request. failed: too many shards are quarantined. aborted: `cause` names an error that no retry can fix,
+    and its fix.
+    """
+
+    end: End
+    cause: str
+    totals: JobTotals
+    elapsed_s: float
+    start_s: float = 0.0  # before the driver began
+
+    @property
+    def remaining(self) -> int:
+        return self.totals.shards - self.totals.finished
+
+    @property
+    def exit_code(self) -> int:
+        """Exit status of the command line."""
+        return EXIT_CODES.get(self.end, 0)
+
+    def plus(self, later: JobSummary) -> JobSummary:
+        """The sum of both, for one job over several runs, with the worse end and its first cause."""
+        worst = max(self, later, key=lambda summary: get_args(End).index(summary.end))
+        totals = self.totals.plus(later.totals)
+        return JobSummary(worst.end, worst.cause, totals, self.elapsed_s + later.elapsed_s)
+
+
+def empty_summary() -> JobSummary:
+    """Summary of a job without work."""
+    return JobSummary("complete", "", JobTotals(0), 0.0)
+
+
+class StopRequest:
+    """Counts stop requests. Safe to use in a signal handler."""
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def ask(self) -> None:
+        self._count += 1
+
+    @property
+    def drain(self) -> bool:
+        """Whether to start nothing more and wait a bounded time for running attempts."""
+        return self._count >= 1
+
+    @property
+    def force(self) -> bool:
+        return self._count >= 2
+
+
+@contextmanager
+def stop_on_signals(stop: StopRequest, interrupt: bool = False) -> Generator[StopRequest]:
+    """Make Ctrl-C and SIGTERM stop requests within the block; the handlers are restored after it.
+
+    With `interrupt` the second signal also raises KeyboardInterrupt, which is the only way to stop shards
+    that run in this process.
+    """
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        stop.ask()
+        if interrupt and stop.force:
+            raise KeyboardInterrupt
+
+    # Python lets the main thread alone handle signals; a job in another one is stopped by `datagen cancel`.
+    numbers = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
+    before = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,56 @@
+"""Read TOML files that a user names, and describe the first wrong field of one."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from datagen.schemas.errors import InputError
+from datagen.schemas.untrusted_files import read_regular
+
+_MAX_BYTES = 1 << 20
+_MAX_DEPTH = 16
+
+
+def read_toml(
+    path: Path, fix: str = "Give a TOML file as in docs/reference/specification.md"
+) -> dict[str, Any]:
+    """The content of a TOML file. InputError, with `fix`, where it is not TOML, too large or unreadable."""
+    data = read_regular(path, _MAX_BYTES, fix)
+    try:
+        return parse_toml(data.decode())
+    except ValueError as error:
+        raise InputError(path, "", f"is not TOML: {error}", fix) from None
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return the content of TOML text. ValueError where it is not TOML, or nested too deeply."""
+    # The parser's memory grows with the square of the number of parts of a dotted key.
+    if any(line.count(".") > 1000 for line in text.splitlines()):
+        raise ValueError("nested too deeply: more than 1000 dots in a line")
+    try:
+        document = tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    level: list[Any] = [document]
+    for _ in range(_MAX_DEPTH):  # dotted keys nest without brackets, beyond the recursion limit
+        tables = [value.values() if isinstance(value, dict) else value for value in level]
+        level = [value for table in tables for value in table if isinstance(value, dict | list)]
+    if level:
+        raise ValueError("nested too deeply")
+    return document
+
+
+def first_of(error: ValidationError, place: str, *section: str) -> InputError:
+    """The InputError for the first wrong field of a file, or of a section of it."""
+    first = error.errors()[0]
+    field = ".".join((*section, *map(str, first["loc"])))
+    fix = (
+        "Remove or correct the key: docs/reference/specification.md lists all"
+        if (first["type"] == "extra_forbidden")
+        else "Correct the value"
+    )
+    return InputError(place, field, f"{first['msg']} (given: {str(first['input'])[:80]})", fix)
