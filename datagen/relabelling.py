@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -286,19 +285,15 @@ def _write(
     fresh: dict[str, bytes] = {}
     for entry in before.files:
         data = files.get(entry.path)
-        made = entry if data is None else _entry(entry.path, data)
+        made = entry if data is None else FileEntry.of(entry.path, data)
         entries.append(made)
         if data is not None and made != entry:
             fresh[f"{new}/{entry.path}"] = data
         else:
             kept.append((f"{old}/{entry.path}", f"{new}/{entry.path}"))
     largest = max((entry.size for entry in before.files), default=0)
-    with run.nothing_left_behind(before.shard, attempt, ours=True):
+    with run.nothing_left_behind(before.shard, attempt):
         run.storage.adopt_many(source.storage, kept, largest)
         run.storage.put_many(fresh)
         run.storage.sync(f"{new}/{entry.path}" for entry in entries)
     return tuple(entries), sum(map(len, fresh.values()))
-
-
-def _entry(path: str, data: bytes) -> FileEntry:
-    return FileEntry(path=path, size=len(data), sha256=sha256(data).hexdigest())

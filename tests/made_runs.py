@@ -86,7 +86,7 @@ def write(run: Run, shard: int, attempt: str) -> Commit:
     files = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
     sums = dict(zip(REDRAW_CAUSES, scenes["redraws"].sum(axis=0).tolist(), strict=True))
     redraws = {cause: count for cause, count in sums.items() if count}
-    entries = run.write_shard(shard, attempt, files, ours=True)
+    entries = run.write_shard(shard, attempt, files)
     return commit_of(run, shard, attempt, entries, int(samples["label"].sum()), redraws)
 
 

@@ -1,9 +1,9 @@
-"""Damage of every kind to a run: damage that checks miss, and bytes that repair does not restore.
+"""Damage of every kind to a run: damage that checks miss, and bytes that repair and resume do not restore.
 
     python -m benchmarks.faults.damage [--flips 1000] [--cuts-every 1] [--repair-every 1]
 
 Random single bit flips over every sort of file, and each file in turn removed, cut and grown; each damage is
-checked, repaired and checked again, and the run is then compared with the original, byte by byte.
+checked, repaired, resumed and checked again, and the run is then compared with the original, byte by byte.
 """
 
 from __future__ import annotations

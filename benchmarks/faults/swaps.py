@@ -5,7 +5,8 @@
 Two files of one sort exchange their names: records and their copies, and chunks of equal size; within a
 run, between the parts of a merged run, and between a sealed run, one that is not sealed and a merged
 run. After each swap the runs are checked, repaired and checked again. `restored`: every byte is as
-before. `left`: checks still find something, and only the two files differ. Anything else is wrong.
+before. `set aside`: so are the rows, after a resume. `left`: checks still find something, and only the two
+files differ. Anything else is wrong.
 """
 
 from __future__ import annotations
@@ -38,12 +39,19 @@ def main() -> None:
             raise SystemExit("the sound runs have findings")
         for swap in swaps(clean, chosen.each or None, np.random.default_rng(chosen.seed)):
             try_swap(clean, Path(folder) / "world", swap, found)
-    print(f"{'swapped':<26}{'tried':>10}{'restored':>10}{'left':>10}")
+    print(f"{'swapped':<26}{'tried':>10}{'restored':>10}{'set aside':>10}{'left':>10}")
     sums = Counter({"tried": 0})
     for kind in sorted(found.tried):
-        print(f"{kind:<26}{found.tried[kind]:>10}{found.restored[kind]:>10}{found.left[kind]:>10}")
-        sums.update(tried=found.tried[kind], restored=found.restored[kind], left=found.left[kind])
-    print(f"{'all':<26}{sums['tried']:>10}{sums['restored']:>10}{sums['left']:>10}")
+        each = {
+            "tried": found.tried,
+            "restored": found.restored,
+            "set aside": found.set_aside,
+            "left": found.left,
+        }
+        counts = {name: of[kind] for name, of in each.items()}
+        print(f"{kind:<26}" + "".join(f"{count:>10}" for count in counts.values()))
+        sums.update(counts)
+    print(f"{'all':<26}" + "".join(f"{count:>10}" for count in sums.values()))
     print(f"{len(found.wrong)} wrong; {time.perf_counter() - began_s:.0f} s")
     for wrong in found.wrong[:50]:
         print(wrong)

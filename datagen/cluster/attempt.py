@@ -37,7 +37,8 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
     made = run_shard(task.spec, world, task.scene_indices, stored, run.schema.version)
     with ends_job(), made.clock.stage("write"):
         files = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
-        entries = run.write_shard(task.shard, task.attempt, files, ours=True)
+        with run.nothing_left_behind(task.shard, task.attempt):
+            entries = run.write_shard(task.shard, task.attempt, files)
     labels = made.sample["label"]
     cost = meter.cost(made.clock, written_bytes=sum(entry.size for entry in entries))
     positives = int(labels.sum())

@@ -129,4 +129,6 @@ def _seal(report: dict[str, Any]) -> str:
         return "yes, data.zarr"
     if report["sealed_labels"] is None:
         return "no"
-    return f"data.zarr is out of date ({report['sealed_labels']:,} labels): run datagen seal again"
+    return (
+        f"data.zarr is out of date ({report['sealed_labels']:,} labels): `datagen verify --repair` seals it"
+    )

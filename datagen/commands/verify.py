@@ -1,68 +1,95 @@
-"""`datagen verify`: check every record and every byte of a run."""
+"""`datagen verify`: check every record and every byte of a run; repair it, replay scenes, or clean it."""
 
 from __future__ import annotations
 
-import secrets
+import shlex
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from datagen.console.options import AS_FOUND, AsJson, RunPath, Sources, Whole
-from datagen.console.printing import counted, print_json, print_lines, print_rows, seconds, size
+from datagen.console.options import AsJson, AssetSources, RunPath, Sources, Whole
+from datagen.console.printing import counted, listed, print_json, print_lines, print_rows, seconds, size
 from datagen.display.progress import counting
 from datagen.schemas.checking.check_runs import Checked, check_runs
+from datagen.schemas.checking.cleaning import Cleaned, clean_runs, refuse_running
 from datagen.schemas.checking.finding import Finding
+from datagen.schemas.checking.repair import Repaired, repair_runs
 from datagen.schemas.errors import InputError, printable
-from datagen.schemas.run import Run
 from datagen.schemas.storage import Storage, open_storage
 
 _KEPT = 10_000  # findings that are listed; all are counted
 _SHOWN = 50  # of them on a terminal
+_AS_FOUND = AssetSources()
 
 
 def verify(
     run: RunPath,
     /,
     *,
-    deep: Whole = 0,
-    seed: Whole | None = None,
-    given: Sources = AS_FOUND,
+    repair: bool = False,
+    replay: Whole = 0,
+    clean: bool = False,
+    given: AssetSources = _AS_FOUND,
     json: AsJson = False,
 ) -> int:
     """Check a run: every record and its copy, every file and its rows, the ledger, the sealed store.
 
-    No file is written. Each finding names the file, the problem and the fix. Exit code 0 when there is no
-    damage, else 1. With --deep, labels are also computed again.
+    Each finding names the file, the problem and the fix. Exit code 0 when there is no damage, else 1. No file
+    is written without --repair or --clean, which are refused while a job of the run may be alive.
 
     For example: datagen verify runs/first
 
     Args:
-        deep: Number of random samples and of random scenes to compute again.
-        seed: Seed of the samples and scenes of --deep [random].
+        repair: Restore records from their copies, move damaged shards into set-aside/, and seal the run
+            again. `datagen resume` then makes these shards again.
+        replay: Number of scenes to make again from specification and assets, evenly spaced over the run, and
+            to compare bit for bit.
+        clean: Remove files that no record names and that are older than an hour: of unfinished or
+            superseded attempts.
     """
-    if not 0 <= deep <= 1_000_000:
-        raise InputError("--deep", str(deep), "is not between 0 and 1,000,000", "Give a number of samples")
+    if not 0 <= replay <= 1_000_000:
+        raise InputError("--replay", str(replay), "is not between 0 and 1,000,000", "Give a number of scenes")
     storage = open_storage(run, probe=False, create=False)
-    checked, found = Checked(), Found()
+    if clean:
+        refuse_running(storage)  # before the check, which takes time
+    checked, found, repaired, cleaned = Checked(), _Found(), None, None
     with counting("shards checked", as_json=json) as seen:
-        found.take(check_runs(storage, checked, seen))
-    chosen = secrets.randbits(32) if seed is None else seed
-    recomputed = deep > 0 and not found.damage
-    if recomputed:
-        found.take(_deep(storage, checked.runs, deep, chosen, given))
-    report = _report(run, checked, found)
-    report["deep"] = {"asked": deep, "done": recomputed, "seed": chosen} if deep else None
+        if repair:
+            repaired = repair_runs(storage, seen)
+            checked = repaired.checked
+            found.take(repaired.left)
+        else:
+            found.take(check_runs(storage, checked, seen))
+    replayed = min(replay, checked.samples) if not found.damage else 0
+    if replayed:
+        _replay(storage, checked, found, replay, given, json)
+    if clean:
+        with counting("shards searched", as_json=json) as seen:
+            cleaned = clean_runs(storage, seen)
+    report = _report(run, checked, found, repaired, cleaned)
+    report["replay"] = {"asked": replay, "done": bool(replayed)} if replay else None
     if json:
         print_json(report)
     else:
-        _print(report, checked, found)
+        _print(report, checked, found, repaired)
     return 1 if found.damage else 0
 
 
-class Found:
+def _replay(
+    storage: Storage, checked: Checked, found: _Found, count: int, given: AssetSources, json: bool
+) -> None:
+    # Simulators are imported only for --replay.
+    from datagen.replaying import replay_findings
+
+    sources = Sources(houses=given.houses, objects=given.objects)
+    with counting("scenes made again", as_json=json) as seen:
+        for run, finding in replay_findings(checked.runs, count, sources, seen):
+            folder = run.storage.url.removeprefix(storage.url).strip("/")
+            found.take([replace(finding, key=f"{folder}/{finding.key}".strip("/"))])
+
+
+class _Found:
     """Findings as they are found: all are counted, the first are kept."""
 
     def __init__(self) -> None:
@@ -82,29 +109,14 @@ class Found:
         return self.counts.total() - self.counts["stale"]
 
 
-def _deep(storage: Storage, runs: list[Run], count: int, seed: int, given: Sources) -> Iterator[Finding]:
-    """Findings of samples and scenes computed again, divided among the runs."""
-    # Simulators are imported only for --deep.
-    from datagen.regeneration.deep_check import deep_findings
-    from datagen.regeneration.scenes import open_sources
-
-    rng = np.random.default_rng(seed)
-    shares = np.full(len(runs), count // len(runs))
-    shares[: count % len(runs)] += 1
-    for run, share in zip(runs, shares.tolist(), strict=True):
-        origin = open_sources(run, given, needs_scenes=False)
-        folder = run.storage.url.removeprefix(storage.url).strip("/")
-        for finding in deep_findings(run, share, origin, rng):
-            yield replace(finding, key=f"{folder}/{finding.key}".strip("/"))
-
-
-def finding_row(finding: Finding) -> dict[str, Any]:
-    """A finding as plain values."""
+def _finding_row(finding: Finding) -> dict[str, Any]:
     fields = {name: getattr(finding, name) for name in ("kind", "problem", "fix", "shard")}
     return {"file": finding.key, **fields, "repairable": finding.cure is not None}
 
 
-def _report(run: str, checked: Checked, found: Found) -> dict[str, Any]:
+def _report(
+    run: str, checked: Checked, found: _Found, repaired: Repaired | None, cleaned: Cleaned | None
+) -> dict[str, Any]:
     totals = checked.totals
     return {
         "run": run,
@@ -123,12 +135,21 @@ def _report(run: str, checked: Checked, found: Found) -> dict[str, Any]:
             "commits_wall_s": totals.committed_wall_s,
             "waste_wall_s": totals.wasted_wall_s,
         },
+        "repaired": None
+        if repaired is None
+        else {
+            "restored": sorted(repaired.restored),
+            "set_aside": sorted(repaired.set_aside),
+            "into": repaired.into if repaired.set_aside else "",
+            "sealed": repaired.resealed,
+        },
+        "removed": None if cleaned is None else {"files": cleaned.files, "bytes": cleaned.bytes},
         "counts": dict(sorted(found.counts.items())),
-        "findings": [finding_row(finding) for finding in found.kept],
+        "findings": [_finding_row(finding) for finding in found.kept],
     }
 
 
-def _print(report: dict[str, Any], checked: Checked, found: Found) -> None:
+def _print(report: dict[str, Any], checked: Checked, found: _Found, repaired: Repaired | None) -> None:
     totals = checked.totals
     wall_s = totals.committed_wall_s + totals.wasted_wall_s
     files, attempts = counted(checked.files, "file"), counted(totals.attempts, "attempt")
@@ -142,23 +163,30 @@ def _print(report: dict[str, Any], checked: Checked, found: Found) -> None:
         ),
         ("sealed", "yes" if checked.is_sealed else "no"),
     ]
-    deep = report["deep"]
-    if deep:
-        count = deep["asked"]
-        done = f"{counted(count, 'sample')} and {counted(count, 'scene')} computed again"
-        rows.append(
-            ("deep", f"{done} (--seed {deep['seed']})" if deep["done"] else "not done: repair the run first")
-        )
+    if repaired is not None:
+        rows.append(("restored", counted(len(repaired.restored), "record")))
+        rows.append(("set aside", listed(sorted(repaired.set_aside)) or "nothing"))
+        if repaired.set_aside:
+            rows.append(("", f"now in {repaired.into}; to make shards again: {_resume(report['run'])}"))
+    if (replay := report["replay"]) is not None:
+        done = f"{counted(replay['asked'], 'scene')} made again and compared bit for bit"
+        rows.append(("replay", done if replay["done"] else "not done: repair the run first"))
+    if (removed := report["removed"]) is not None:
+        rows.append(("removed", f"{counted(removed['files'], 'leftover file')}, {size(removed['bytes'])}"))
     state = "clean" if not found.damage else counted(found.damage, "finding")
     print_rows(f"{state}: {report['run']}", rows)
-    print_findings("found", found.kept, sum(found.counts.values()))
+    _print_findings(found.kept, found.counts.total())
 
 
-def print_findings(title: str, findings: list[Finding], total: int) -> None:
+def _resume(run: str) -> str:
+    return f"datagen resume {shlex.quote(run)}"
+
+
+def _print_findings(findings: list[Finding], total: int) -> None:
     """List the findings: the file, and below it the problem and the fix."""
     if not findings:
         return
-    lines = [f"{title}: the file, the problem, the fix"]
+    lines = ["found: the file, the problem, the fix"]
     for finding in findings[:_SHOWN]:
         lines += [f"  {printable(finding.key)}", f"      {printable(f'{finding.problem}. {finding.fix}')}"]
     if total > _SHOWN:

@@ -15,7 +15,7 @@ from datagen.console.command_lines import given_options, words_of
 from datagen.console.options import AS_FOUND, Sources
 from datagen.doctor.engines import probe_render_device
 from datagen.jobs.job import JobOptions, JobRun
-from datagen.regeneration.scenes import open_sources
+from datagen.replaying import open_sources
 from datagen.schemas.errors import InputError, refuse_not_utf8
 from datagen.schemas.record_files import different_fields
 from datagen.schemas.run import Run

@@ -6,10 +6,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from math import fsum
 
-from datagen.schemas.checking.commits import ODD_COST_FIX, odd_cost
-from datagen.schemas.checking.finding import REPAIR, Finding, below
+from datagen.schemas.checking.attempts import ODD_COST_FIX, odd_cost
+from datagen.schemas.checking.finding import Finding, below
 from datagen.schemas.keys import commit_key
 from datagen.schemas.ledger import end_key
+from datagen.schemas.record_files import REPAIR
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, other_value
 from datagen.schemas.summaries import CommitSummary, EndSummary, Summaries

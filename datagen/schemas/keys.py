@@ -4,8 +4,8 @@ from __future__ import annotations
 
 # The record of merged runs, which names the parts.
 MERGED = "merged.json"
-# Marks the folder of an attempt that is being removed.
-REMOVING = "removing"
+# The folder of files that a repair has set aside.
+SET_ASIDE = "set-aside"
 
 
 def shard_folder(shard: int, attempt: str) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
-from datagen.schemas.record_files import read_record, refuse_other_format
+from datagen.schemas.record_files import REPAIR, read_record, refuse_other_format
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Merged, other_value
 from datagen.schemas.storage import Storage, open_storage
@@ -27,7 +27,7 @@ def open_runs(path: Storage | Path | str) -> list[Run]:
     runs = [Run.open(storage.below(part_folder(spec_hash))) for spec_hash in merged.parts]
     for run, spec_hash in zip(runs, merged.parts, strict=True):
         if found := other_value(run.manifest, spec_hash=spec_hash):
-            raise InputError(f"{run.storage.url}/manifest.json", *found, "Repair it with `datagen repair`")
+            raise InputError(f"{run.storage.url}/manifest.json", *found, REPAIR)
     return runs
 
 

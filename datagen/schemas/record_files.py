@@ -20,7 +20,8 @@ from datagen.schemas.storage import Storage
 from datagen.schemas.storage.errors import NotARegularFile
 
 MAX_RECORD_BYTES = 16 * 2**20
-_FIX = "Repair it with `datagen repair`, or restore the file from a copy"
+REPAIR = "Repair it with `datagen verify --repair`"
+_FIX = f"{REPAIR}, or restore the file from a copy"
 # The last line of a record: the sha256 of every byte before it. The rest is JSON without its closing brace.
 _TRAILER = re.compile(rb',\n "sha256": "([0-9a-f]{64})"\n}\n\Z')
 _TRAILER_BYTES = len(b',\n "sha256": ""\n}\n') + 64

@@ -6,20 +6,15 @@ of two racing attempts one wins and the other is waste.
 
 from __future__ import annotations
 
-import errno
-import os
 import re
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from hashlib import sha256
 from pathlib import Path
-from typing import Literal
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import RecordSchema, sized_schema
 from datagen.schemas.keys import (
     MERGED,
-    REMOVING,
     commit_copy_key,
     commit_key,
     part_folder,
@@ -28,6 +23,7 @@ from datagen.schemas.keys import (
 from datagen.schemas.ledger import MAX_STACK_CHARS, Ledger
 from datagen.schemas.record_files import (
     MAX_RECORD_BYTES,
+    REPAIR,
     decode_record,
     encode_record,
     publish,
@@ -54,10 +50,6 @@ from datagen.schemas.storage import Storage, open_storage
 from datagen.schemas.storage.errors import StoreUnavailable
 
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
-# Result of removing an attempt. `damaged`: it was committed while its files were removed.
-Removal = Literal["removed", "spared", "damaged"]
-_MOST_PLANS = 10**9
-AGAIN = "Run the same command again after `datagen gc` has ended: it makes the missing shards"
 
 
 class Run:
@@ -140,12 +132,6 @@ class Run:
             number, wanted = self._newest_plan()
             if wanted >= n:
                 return
-            if number >= _MOST_PLANS:  # the next name would be invalid
-                place, problem = (
-                    f"{self.storage.url}/plans/{number}.json",
-                    "is beyond the largest number of plans",
-                )
-                raise InputError(place, "", problem, "Move it out of the run")
             number, spec_hash = number + 1, self.manifest.spec_hash
             plan = Plan(n=n, created=created or utc_now(), spec_hash=spec_hash, number=number)
             # Where another plan appeared meanwhile, read the newest again.
@@ -163,7 +149,7 @@ class Run:
         number = max(numbers)
         plan = read_record(self.storage, key := f"plans/{number}.json", Plan)
         if plan and (found := other_value(plan, spec_hash=self.manifest.spec_hash, number=number)):
-            raise InputError(f"{self.storage.url}/{key}", *found, "Repair it with `datagen repair`")
+            raise InputError(f"{self.storage.url}/{key}", *found, REPAIR)
         return (number, plan.n) if plan else self._newest_plan()
 
     # Shards and commits.
@@ -208,77 +194,37 @@ class Run:
             if data is not None:  # else it was removed since the listing
                 yield self.decode_commit(shard, data)
 
-    def write_shard(
-        self, shard: int, attempt: str, files: Mapping[str, bytes], ours: bool = False
-    ) -> tuple[FileEntry, ...]:
-        """Write an attempt's files durably; return the entries for its commit.
-
-        `ours`: no other process can commit an attempt of this name.
-        """
+    def write_shard(self, shard: int, attempt: str, files: Mapping[str, bytes]) -> tuple[FileEntry, ...]:
+        """Write an attempt's files durably; return the entries for its commit."""
         folder = shard_folder(shard, attempt)
-        entries = tuple(
-            FileEntry(path=path, size=len(data), sha256=sha256(data).hexdigest())
-            for path, data in files.items()
-        )
-        with self.nothing_left_behind(shard, attempt, ours):
-            self.storage.put_many({f"{folder}/{path}": data for path, data in files.items()})
-            self.storage.sync(f"{folder}/{path}" for path in files)
-        return entries
+        self.storage.put_many({f"{folder}/{path}": data for path, data in files.items()})
+        self.storage.sync(f"{folder}/{path}" for path in files)
+        return tuple(FileEntry.of(path, data) for path, data in files.items())
 
     @contextmanager
-    def nothing_left_behind(self, shard: int, attempt: str, ours: bool = False) -> Generator[None]:
+    def nothing_left_behind(self, shard: int, attempt: str) -> Generator[None]:
         """Remove the files that the block wrote for an attempt where the disk fails, to free a full disk.
 
-        An attempt that is `ours` is removed at once; another one needs a mark, for which a full disk may lack
-        space, so that its files may stay until `gc`.
+        Only for attempts whose name no other process can commit.
         """
         folder = shard_folder(shard, attempt)
         try:
             yield
         except StoreUnavailable:
             raise  # deleting would fail too
-        except InputError as error:
-            with suppress(InputError):
-                if ours:
-                    self.storage.delete([file.key for file in self.storage.list(folder)])
-                    self.storage.remove_empty(folder)
-                else:
-                    self.remove_attempt(shard, attempt)
-            if error.problem == os.strerror(errno.ENOENT):  # `gc` removed it
-                raise InputError(error.place, error.field, error.problem, AGAIN) from error
-            raise
-
-    def remove_attempt(self, shard: int, attempt: str) -> Removal:
-        """Remove an attempt's files, unless its shard's commit may name it (see `garbage_collection`)."""
-        folder = shard_folder(shard, attempt)
-        mark = f"{folder}/{REMOVING}"
-        self.storage.put(mark, b"")
-        self.storage.sync([mark])
-        if self._is_committed(shard, attempt) is not False:
-            self.storage.delete([mark])
-            return "spared"
-        self.storage.delete([file.key for file in self.storage.list(folder) if file.key != mark])
-        broken = self._is_committed(shard, attempt)
-        self.storage.delete([mark])
-        self.storage.remove_empty(folder)
-        return "damaged" if broken else "removed"
-
-    def _is_committed(self, shard: int, attempt: str) -> bool | None:
-        """Whether a shard's current commit names the attempt; None where it cannot be read."""
-        data = self.storage.get(commit_key(shard), MAX_RECORD_BYTES)
-        try:
-            return data is not None and self.decode_commit(shard, data).attempt == attempt
         except InputError:
-            return None
+            with suppress(InputError):
+                self.storage.delete([file.key for file in self.storage.list(folder)])
+                self.storage.remove_empty(folder)
+            raise
 
     def commit(self, commit: Commit) -> bool:
         """Commit a shard. False where another attempt is committed; the files are then garbage.
 
-        The attempt's folder keeps a copy of the record, from which a damaged one is restored. The commit of
-        an attempt whose files are removed as garbage meanwhile is withdrawn (see `garbage_collection`).
+        The attempt's folder keeps a copy of the record, from which a damaged one is restored. InputError
+        where a file of the attempt is missing, for example removed by `datagen verify --clean`.
         """
-        if (problem := self._lack(commit, committing=True)) is not None:
-            raise problem
+        self.check_files(commit)
         record = encode_record(commit)
         copy = commit_copy_key(commit.shard, commit.attempt)
         self.storage.put(copy, record)
@@ -286,34 +232,19 @@ class Run:
         won = self.storage.put_new(commit_key(commit.shard), record)
         if not won:
             self.storage.delete([copy])
-        elif (problem := self._lack(commit, committing=True)) is not None:
-            # With its copy, which would restore the commit.
-            self.storage.delete([commit_key(commit.shard), copy])
-            raise problem
         return won
 
     def check_files(self, commit: Commit) -> None:
         """Raise InputError for a commit whose files are missing or of another size (bytes are not read)."""
-        if (problem := self._lack(commit)) is not None:
-            raise problem
-
-    def _lack(self, commit: Commit, committing: bool = False) -> InputError | None:
         folder = shard_folder(commit.shard, commit.attempt)
-        fix = AGAIN if committing else "Restore the file from a copy, or run `datagen repair`"
         sizes = {f.key: f.size for f in self.storage.list(folder)}
-        if committing and (mark := f"{folder}/{REMOVING}") in sizes:
-            place, problem = f"{self.storage.url}/{mark}", "the attempt is being removed as garbage"
-            return InputError(place, "", problem, fix)
         for entry in commit.files:
-            size = sizes.get(f"{folder}/{entry.path}")
+            size = sizes.get(key := f"{folder}/{entry.path}")
             if size != entry.size:
-                return InputError(
-                    f"{self.storage.url}/{folder}/{entry.path}",
-                    "",
-                    "is missing" if size is None else f"has {size} bytes, but {entry.size} were committed",
-                    fix,
+                problem = (
+                    "is missing" if size is None else f"has {size} bytes, but {entry.size} were committed"
                 )
-        return None
+                raise InputError(f"{self.storage.url}/{key}", "", problem, REPAIR)
 
     # Quarantine.
 

@@ -5,6 +5,7 @@ They are validated when read from disk.
 
 from __future__ import annotations
 
+from hashlib import sha256
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -95,9 +96,8 @@ class Plan(StoredRecord):
 
     n: int = Field(ge=1, le=10**12)
     created: str
-    # The run and the plan's own number; None in older records.
-    spec_hash: Digest | None = None
-    number: int | None = Field(default=None, ge=1)
+    spec_hash: Digest
+    number: int = Field(ge=1)
 
 
 class Merged(StoredRecord):
@@ -113,6 +113,11 @@ class FileEntry(StoredRecord):
     path: FilePath
     size: int = Field(ge=0, le=2**40)
     sha256: Digest
+
+    @classmethod
+    def of(cls, path: str, data: bytes) -> FileEntry:
+        """The entry of a file with these bytes."""
+        return cls(path=path, size=len(data), sha256=sha256(data).hexdigest())
 
 
 class Cost(StoredRecord):

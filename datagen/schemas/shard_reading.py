@@ -33,7 +33,7 @@ Array = npt.NDArray[Any]
 MAX_META_BYTES = 2**20
 MAX_DECODED_BYTES = 2**30  # far above any real chunk
 _CHECKED = b""
-_FIX = "Restore the file from a copy, or repair the run with `datagen repair`"
+_FIX = "Restore the file from a copy, or set the shard aside with `datagen verify --repair`"
 
 
 @dataclass(frozen=True)

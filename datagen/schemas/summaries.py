@@ -33,7 +33,7 @@ from datagen.schemas.run_records import (
     other_value,
 )
 
-# Files of the former format have such names too: `refresh` and `gc` remove them.
+# Files of the former format have such names too: `refresh` and `verify --clean` remove them.
 _FILE = re.compile(r"index/[0-9a-f]{1,16}\.json\.gz")
 # Rows of a full file. Files with fewer than half of it are joined when the index grows.
 ROWS_PER_FILE = 16_384

@@ -72,10 +72,10 @@ def stored_scenes(
     for name in ROBOT_FIELDS:
         if (np.diff(columns[name][order])[same] != 0).any():
             problem = "differs between samples of one robot"
-            raise InputError(place, name, problem, "Repair the run with `datagen repair`")
+            raise InputError(place, name, problem, "Repair the run with `datagen verify --repair`")
     if not np.isin(columns["n_points"], np.arange(columns["points_m"].shape[1] + 1)).all():
         problem = "is not between 0 and the size of the cloud"
-        raise InputError(place, "n_points", problem, "Repair the run with `datagen repair`")
+        raise InputError(place, "n_points", problem, "Repair the run with `datagen verify --repair`")
     scene_columns = {name: columns[name] for name, dim in dims.items() if dim == "scene"}
     sample_columns = {name: columns[name] for name, dim in dims.items() if dim == "sample"}
     if 2 * len(rows) < len(bounds) - 1:  # few are used: copy them, to free the shard's arrays

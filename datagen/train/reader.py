@@ -86,7 +86,7 @@ def load_shard(place: ShardPlace, arrays: Mapping[str, StoredArray]) -> tuple[Co
             f"{place.storage.url}/{place.folder}",
             "sample_scene_index",
             "has a sample of a scene outside its shard, or in another order",
-            "Repair it with `datagen repair`",
+            "Repair it with `datagen verify --repair`",
         )
     return columns, bounds
 

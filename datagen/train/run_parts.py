@@ -134,7 +134,7 @@ def _refuse_other_arrays(place: ShardPlace, arrays: Mapping[str, StoredArray]) -
                 f"{place.storage.url}/{place.folder}/{name}/zarr.json",
                 name,
                 "differs from the other shards' metadata",
-                "Repair it with `datagen repair`",
+                "Repair it with `datagen verify --repair`",
             )
 
 

@@ -1,8 +1,9 @@
-"""`datagen verify` as a user meets it: exit codes, the table, JSON, and rows computed again."""
+"""`datagen verify`: exit codes, table and JSON; repair, replay and clean on real runs."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,27 +11,34 @@ import numpy as np
 import pytest
 
 from datagen import cli
+from datagen.schemas.jobs import JobRecord, Jobs, new_job_id
+from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import LedgerEntry
 from tests.datagen.forged import forge
 from tests.refusals import refused
-from tests.small_runs import PER_SCENE, files_of
+from tests.small_runs import HERE, PER_SCENE, files_of
 
 
 def verified(run: Path, capture: pytest.CaptureFixture[str], code: int, *more: str) -> dict[str, Any]:
-    """What verify says, with the exit code that it must have."""
+    """The report of verify, with the exit code that it must have."""
     capture.readouterr()
     assert cli.run(["verify", str(run), "--json", *more]) == code
     return json.loads(capture.readouterr().out)
 
 
-def test_a_finished_run_is_clean_also_when_its_rows_are_computed_again(
+def truncate(file: Path) -> None:
+    file.chmod(0o644)
+    file.write_bytes(file.read_bytes()[:-1])
+
+
+def test_a_finished_run_is_clean_and_its_scenes_are_made_again(
     finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = files_of(finished)
-    report = verified(finished, capsys, 0, "--deep", "3", "--seed", "5")
+    report = verified(finished, capsys, 0, "--replay", "9")
     assert (report["clean"], report["findings"], report["sealed"]) == (True, [], True)
-    assert report["deep"] == {"asked": 3, "done": True, "seed": 5}
+    assert report["replay"] == {"asked": 9, "done": True}
     assert report["samples"] == 3 * PER_SCENE
     assert report["files"] == sum(len(c.files) for c in Run.open(finished).commits())
     ledger = report["ledger"]
@@ -40,38 +48,79 @@ def test_a_finished_run_is_clean_also_when_its_rows_are_computed_again(
     assert "clean" in capsys.readouterr().out
 
 
-def test_findings_are_told_with_file_problem_and_fix(
-    copied: Path, capsys: pytest.CaptureFixture[str]
+def test_damaged_shards_are_set_aside_and_made_again(
+    finished: Path, copied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (copied / "plans/1.json").unlink()
     chunk = next((copied / "shards/000000").glob("*/rgb/c.0.0.0"))
-    chunk.chmod(0o644)
-    chunk.write_bytes(chunk.read_bytes()[:-1])
-    report = verified(copied, capsys, 1, "--deep", "1")
-    assert report["counts"] == {"file": 1, "record": 1} and not report["deep"]["done"]
+    truncate(chunk)
+    report = verified(copied, capsys, 1, "--replay", "1")
+    assert report["counts"] == {"file": 1, "record": 1} and not report["replay"]["done"]
     assert [f["file"] for f in report["findings"]] == ["plans/1.json", str(chunk.relative_to(copied))]
     assert all(f["repairable"] for f in report["findings"])
     assert cli.run(["verify", str(copied)]) == 1
     told = capsys.readouterr().out
-    for word in ("2 findings", "plans/1.json", "missing", "datagen repair"):
+    for word in ("2 findings", "plans/1.json", "missing", "datagen verify --repair"):
         assert word in told
+    done = verified(copied, capsys, 0, "--repair", "--clean")["repaired"]
+    assert (done["restored"], done["set_aside"], done["sealed"]) == (
+        ["plans/1.json"],
+        ["shards/000000"],
+        True,
+    )
+    assert (copied / done["into"] / chunk.relative_to(copied)).exists()
+    assert cli.run(["resume", str(copied), *HERE]) == 0
+    assert verified(copied, capsys, 0, "--replay", "3")["clean"]
+    assert files_of(copied, "data.zarr") == files_of(finished, "data.zarr")
 
 
-def test_rows_that_were_forged_are_found_by_computing_them_again(
+def test_a_merged_run_is_repaired_and_resumed(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "merged"
+    assert cli.run(["merge", str(finished), "--out", str(out)]) == 0
+    whole, shard = files_of(out, "data.zarr"), next((out / "shards/000001").iterdir())
+    shutil.rmtree(shard / "label")
+    assert verified(out, capsys, 0, "--repair")["repaired"]["set_aside"] == ["shards/000001"]
+    assert cli.run(["resume", str(out), *HERE]) == 0
+    assert files_of(out, "data.zarr") == whole and verified(out, capsys, 0)["clean"]
+
+
+def test_replay_finds_rows_that_do_not_follow_from_the_specification(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def change(arrays: dict[str, np.ndarray[Any, Any]]) -> None:
         arrays["visibility"][:] = 1 - arrays["visibility"]
+        arrays["settle_steps"] += 1
 
     run = forge(finished, tmp_path / "run", 1, change)
     run.ledger.start("forged", 1)
     run.ledger.end(LedgerEntry(attempt="forged", shard=1, outcome="committed", cost=run.commit_of(1).cost))
-    assert cli.run(["seal", str(tmp_path / "run")]) == 0
-    assert verified(tmp_path / "run", capsys, 0)["clean"]
-    report = verified(tmp_path / "run", capsys, 1, "--deep", "12", "--seed", "1")
-    assert set(report["counts"]) == {"deep"}
-    assert all(f["shard"] == 1 and not f["repairable"] for f in report["findings"])
-    assert all(f["file"].startswith("shards/000001/forged") for f in report["findings"])
+    assert verified(tmp_path / "run", capsys, 0, "--repair")["clean"]
+    report = verified(tmp_path / "run", capsys, 1, "--replay", "3")
+    (finding,) = report["findings"]
+    assert (finding["kind"], finding["shard"], finding["repairable"]) == ("replay", 1, False)
+    assert finding["file"] == "shards/000001/forged"
+    assert "settle_steps: 1 differ, by up to 1" in finding["problem"] and "visibility: " in finding["problem"]
+
+
+def test_a_run_that_labelled_other_scenes_is_replayed_with_and_without_them(
+    copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "again"
+    assert cli.run(["relabel", str(copied), "--out", str(out), "--mu", "0.5"]) == 0
+    assert verified(out, capsys, 0, "--replay", "2")["replay"]["done"]
+    copied.rename(tmp_path / "elsewhere")
+    assert verified(out, capsys, 0, "--replay", "2")["replay"]["done"]
+
+
+@pytest.mark.parametrize("option", ["--repair", "--clean"])
+def test_a_run_with_a_living_job_is_not_changed(
+    option: str, copied: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = JobRecord(id=new_job_id(), command=(), host="h", pid=1, started=utc_now(), address="local")
+    Jobs(Run.open(copied).storage).begin(record)
+    refused(["verify", str(copied), option], capsys, "is running", "datagen cancel")
 
 
 @pytest.mark.parametrize(
@@ -81,22 +130,20 @@ def test_rows_that_were_forged_are_found_by_computing_them_again(
         (["{empty}"], ["not a run"]),
         (["{file}"], ["not a folder"]),
         (["{foreign}"], ["not a run"]),
-        (["{run}", "--deep", "-1"], ["--deep"]),
-        (["{run}", "--deep", "many"], ["--deep"]),
-        (["{run}", "--deep", "1", "--houses", "builtin:3"], ["--houses"]),
+        (["{run}", "--replay", "-1"], ["--replay"]),
+        (["{run}", "--replay", "many"], ["--replay"]),
+        (["{run}", "--replay", "1", "--houses", "builtin:3"], ["--houses"]),
     ],
 )
-@pytest.mark.parametrize("verb", ["verify", "repair"])
+@pytest.mark.parametrize("more", [[], ["--repair"], ["--clean"]], ids=str)
 def test_bad_input(
-    verb: str,
+    more: list[str],
     arguments: list[str],
     words: list[str],
     finished: Path,
     places: dict[str, Path],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    if verb == "repair" and "--deep" in arguments:
-        arguments, words = [arguments[0], "--workers", "-1"], ["--workers"]
     before = files_of(finished)
-    refused([verb, *(a.format(run=finished, **places) for a in arguments)], capsys, *words)
+    refused(["verify", *(a.format(run=finished, **places) for a in arguments), *more], capsys, *words)
     assert files_of(finished) == before and not places["out"].exists()

@@ -87,7 +87,7 @@ def make_counted(task: CountedRows, meter: Meter) -> AttemptResult:
         scenes, samples = rows_of(run, task.shard)
     with clock.stage("write"):
         files = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
-        entries = run.write_shard(task.shard, task.attempt, files, ours=True)
+        entries = run.write_shard(task.shard, task.attempt, files)
     cost = meter.cost(clock, written_bytes=sum(entry.size for entry in entries))
     commit = commit_of(run, task.shard, task.attempt, entries, int(samples["label"].sum()))
     won = run.commit(commit.model_copy(update={"cost": cost, "host": this_host()}))

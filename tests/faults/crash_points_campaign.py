@@ -219,7 +219,7 @@ def _try(
 def _drafts(now: Iterable[str], known: _Reference, shared: bool) -> list[str]:
     """New files that belong to nothing: drafts, and those of an attempt that is not written whole.
 
-    One that is, and lacks only its commit, is left to `gc`: its commit may be on its way.
+    One that is, and lacks only its commit, is left to `verify --clean`: its commit may be on its way.
     """
     drafts: list[str] = []
     by_attempt: dict[str, set[str]] = {}
@@ -267,7 +267,7 @@ def _different(one: Units, other: Units) -> list[str]:
 
 def _look(folder: Path, operation: Operation) -> Units:
     """The units, seen by a process that has never seen the run."""
-    status, told = in_child(lambda: json.dumps(units(folder, operation.places, operation.by_file)))
+    status, told = in_child(lambda: json.dumps(units(folder, operation.places)))
     return json.loads(told) if status == 0 else {"readers": told}
 
 
@@ -275,14 +275,12 @@ def _look_and_resume(folder: Path, operation: Operation) -> tuple[Units, Units, 
     """(units, units when it was resumed, what `verify` finds then)."""
 
     def go() -> str:
-        now = units(folder, operation.places, operation.by_file)
+        now = units(folder, operation.places)
         try:
             (operation.resume or operation.act)(folder)
         except InputError as e:
             return json.dumps([now, {"resuming": str(e)}, []])
-        return json.dumps(
-            [now, units(folder, operation.places, operation.by_file), damage(folder, operation.places)]
-        )
+        return json.dumps([now, units(folder, operation.places), damage(folder, operation.places)])
 
     status, told = in_child(go)
     now, resumed, damaged = json.loads(told) if status == 0 else ({"readers": told}, {}, [])

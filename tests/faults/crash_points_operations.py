@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 
 from datagen.cluster.run_recorder import close_lost_attempts, refresh_index
-from datagen.commands.gc import remove
 from datagen.relabelling import relabel_all, relabelled_specification
 from datagen.schemas.checking.check_runs import Checked, check_runs
+from datagen.schemas.checking.cleaning import clean_runs
 from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS, RecordSchema
-from datagen.schemas.garbage_collection import find_garbage
 from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.merging import merge_runs, plan_merge
@@ -24,10 +22,9 @@ from datagen.schemas.record_files import encode_record, publish
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout, LedgerEntry, Merged, QuarantineRecord
 from datagen.schemas.sealing import SEALED, seal, unseal
-from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.storage import open_storage
 from datagen.schemas.summaries import Summaries
-from tests.made_runs import attempt, check_digests, make_run, manifest_of, rows_of, small_spec, write
+from tests.made_runs import attempt, check_digests, files_of, make_run, manifest_of, small_spec, write
 
 # A shard of few files, so that every call of every operation can be tried. All that these tests and the
 # code below them need of a schema is there: names, texts, a vector, both tables.
@@ -48,8 +45,7 @@ class Operation:
     the user does then (the same again, where it is not given). `places` are the runs in the folder;
     `exact` operations, resumed, leave the very files that they leave undisturbed. Attempts of merges have
     the names that they have in the sources, and another merge may be at them: `shared` ones are not taken
-    back when the disk refuses, as they are links and take no room. Where an operation repairs a sealed store,
-    each of the store's files is a unit (`by_file`), and else the whole store."""
+    back when the disk refuses, as they are links and take no room."""
 
     name: str
     prepare: Callable[[Path], None]
@@ -59,7 +55,6 @@ class Operation:
     fields: tuple[str, ...] = _KEPT
     exact: bool = False
     shared: bool = False
-    by_file: bool = False
 
 
 def small_schema(fields: Iterable[str] = _KEPT) -> RecordSchema:
@@ -72,22 +67,16 @@ def small_schema(fields: Iterable[str] = _KEPT) -> RecordSchema:
     )
 
 
-def units(folder: Path, places: Iterable[str] = ("",), by_file: bool = False) -> Units:
+def units(folder: Path, places: Iterable[str] = ("",)) -> Units:
     """What readers see of runs or of merged runs, unit by unit; each must be as before or as after.
 
     A record that is refused, or a shard whose bytes are not those committed, is a unit of its own value.
     """
-    return {
-        f"{place}:{name}": value
-        for place in places
-        for name, value in _units(folder / place, by_file).items()
-    }
+    return {f"{place}:{name}": value for place in places for name, value in _units(folder / place).items()}
 
 
-def _units(folder: Path, by_file: bool) -> Units:
-    found = _sealed(folder)
-    if not by_file:
-        found = {"sealed": sha256(json.dumps(found).encode()).hexdigest() if found else ""}
+def _units(folder: Path) -> Units:
+    found = {"sealed": _sealed(folder)}
     if not (folder / MERGED).exists() and not (folder / "manifest.json").exists():
         return found
     try:
@@ -143,11 +132,11 @@ def _commit(run: Run, shard: int) -> str:
     return sha256(json.dumps(rows).encode()).hexdigest()
 
 
-def _sealed(folder: Path) -> Units:
-    """The sealed store's files, by their digests."""
-    store = folder / SEALED
-    files = sorted(path for path in store.rglob("*") if path.is_file())
-    return {f"sealed {path.relative_to(store)}": sha256(path.read_bytes()).hexdigest() for path in files}
+def _sealed(folder: Path) -> str:
+    """The digest of the sealed store's files; "" where there is none."""
+    files = files_of(folder / SEALED)
+    digests = {key: sha256(data).hexdigest() for key, data in files.items()}
+    return sha256(json.dumps(digests).encode()).hexdigest() if files else ""
 
 
 # Operations ----------------------------------------------------------------------------------
@@ -249,10 +238,7 @@ def _flip(path: Path) -> None:
 
 
 def _repair(folder: Path) -> None:
-    def regenerate(run: Run, shard: int) -> Mapping[str, bytes]:
-        return encode_shard(run.schema, run.layout, run.manifest.spec_hash, *rows_of(run, shard))
-
-    repaired = repair_runs(open_storage(folder, probe=False), regenerate)
+    repaired = repair_runs(open_storage(folder, probe=False))
     for finding in repaired.left:
         raise InputError(finding.key, "", finding.problem, finding.fix)  # the command ends with 1
 
@@ -267,9 +253,8 @@ def _littered(folder: Path) -> None:
     (folder / f"commits/000002.json.{7:016x}.part").write_bytes(b"{}")
 
 
-def _collect(folder: Path) -> None:
-    place = open_storage(folder, probe=False)
-    remove(place, find_garbage(place, 0.0, time.time() + 60))
+def _clean(folder: Path) -> None:
+    clean_runs(open_storage(folder, probe=False), kept_s=-60)
 
 
 def _relabelled(folder: Path) -> None:
@@ -304,7 +289,7 @@ OPERATIONS = (
     Operation("merge several", lambda f: _apart(f, (0, 1)), _merge, places=("out",), shared=True),
     Operation("repair manifest", _damaged_manifest, _repair),
     Operation("repair records", _damaged_records, _repair),
-    Operation("repair files", _damaged_files, _repair, by_file=True),
-    Operation("gc", _littered, _collect, exact=True),
+    Operation("repair files", _damaged_files, _repair),
+    Operation("clean", _littered, _clean, exact=True),
     Operation("relabel", _relabelled, _relabel, places=("out",), fields=_KEPT_TO_RELABEL),
 )

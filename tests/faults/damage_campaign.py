@@ -1,14 +1,15 @@
-"""A run damaged on purpose, one file at a time: what checks find, and what repair brings back."""
+"""A run damaged on purpose, one file at a time: found, repaired, resumed, and compared with the original."""
 
 from __future__ import annotations
 
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from uuid import uuid4
 
 import numpy as np
 
@@ -16,15 +17,16 @@ from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
 from datagen.schemas.checking.repair import Repaired, repair_runs
 from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.keys import SET_ASIDE
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import LedgerEntry
 from datagen.schemas.sealing import seal
-from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.storage import open_storage
 from tests.faults.crash_points_operations import small_schema
-from tests.made_runs import make_run, rows_of, utc_now
+from tests.made_runs import attempt, files_of, make_run, utc_now
 
-# What has no second source: its loss is found, and cannot be undone bit for bit.
+# Records without a copy: a damaged one is set aside, or restored from what other records say.
 _ALONE = ("ledger/", "quarantine/")
 
 
@@ -81,10 +83,30 @@ def make_place(
     return run
 
 
-def regenerate(run: Run, shard: int) -> Mapping[str, bytes]:
-    """The files of a shard of random rows, computed again."""
-    scenes, samples = rows_of(run, shard)
-    return encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
+def remake(folder: Path) -> None:
+    """Make the missing shards, as `datagen resume` does, and seal."""
+    storage = open_storage(folder, probe=False, create=False)
+    for run in open_runs(storage):
+        for shard in run.missing():
+            assert attempt(run, shard, f"again-{shard}-{uuid4().hex[:8]}")
+    seal(storage)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Root records, the files of shards without the names of their attempts, and the sealed store."""
+    found: dict[str, bytes] = {}
+    for key, data in files_of(folder).items():
+        names = key.split("/")
+        if (
+            names[0] == SET_ASIDE
+            or {"ledger", "commits", "quarantine"} & set(names)
+            or "commit.json" in names
+        ):
+            continue
+        if "shards" in names:
+            del names[names.index("shards") + 2]
+        found["/".join(names)] = data
+    return found
 
 
 def kind_of(key: str) -> str:
@@ -132,7 +154,7 @@ def try_all(
     """Do each damage to a run equal to `clean` and check it; repair every N-th of them, and check again."""
     shutil.rmtree(scratch, ignore_errors=True)
     copy_run(clean, scratch)
-    whole = {key: (clean / key).read_bytes() for key in keys_of(clean)}
+    whole = files_of(clean)
     for number, damage in enumerate(damages):
         campaign.tried[damage.kind] += 1
         name = f"{damage.kind} {damage.key}"
@@ -144,15 +166,17 @@ def try_all(
             continue
         campaign.repaired[damage.kind] += 1
         repaired = repair_at(scratch)
-        if repaired.changed:
-            campaign.not_restored.append(f"{name}: also touched {repaired.changed[:3]}")
-        there = {key: (scratch / key).read_bytes() for key in keys_of(scratch)}
-        # What has no second source may be left as it is, or be written anew from what is known.
+        if repaired.left:
+            campaign.not_clean.append(f"{name}: {repaired.left[:2]}")
+        there = files_of(scratch)
         apart = {key for key in whole.keys() | there.keys() if whole.get(key) != there.get(key)}
-        alone = damage.key.startswith(_ALONE)
-        if apart - ({damage.key} if alone else set()):
+        if repaired.set_aside:
+            remake(scratch)
+            if (left := content(scratch)) != content(clean):
+                campaign.not_restored.append(f"{name}: {sorted(left.items() ^ content(clean).items())[:1]}")
+        elif apart - ({damage.key} if damage.key.startswith(_ALONE) else set()):
             campaign.not_restored.append(f"{name}: {sorted(apart)[:3]}")
-        if not alone and ((left := findings_at(scratch)) or repaired.left):
+        if left := findings_at(scratch):
             campaign.not_clean.append(f"{name}: {left[:2]}")
         if apart:
             shutil.rmtree(scratch)
@@ -203,8 +227,8 @@ def findings_at(folder: Path) -> list[Finding]:
 
 
 def repair_at(folder: Path) -> Repaired:
-    """Repair a place of random rows."""
-    return repair_runs(open_storage(folder, probe=False, create=False), regenerate)
+    """Repair the run, or the merged runs, in a folder."""
+    return repair_runs(open_storage(folder, probe=False, create=False))
 
 
 def _flipped(data: bytes, bit: int) -> bytes:

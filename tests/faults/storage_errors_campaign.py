@@ -65,7 +65,7 @@ def _damaged(folder: Path) -> None:
 
 OPERATIONS = (
     Operation("attempt", lambda folder: make_run(folder, 20, shards=[0]), lambda f: ["attempt", str(f)]),
-    Operation("seal", lambda folder: make_run(folder, 20), lambda f: ["seal", str(f)]),
+    Operation("seal", lambda folder: make_run(folder, 20), lambda f: ["verify", str(f), "--repair"]),
     Operation(
         "merge",
         _apart,
@@ -73,7 +73,7 @@ OPERATIONS = (
         places=("out",),
     ),
     # What cannot be read or put back is a finding.
-    Operation("repair", _damaged, lambda f: ["repair", str(f)], codes=(1, 2)),
+    Operation("repair", _damaged, lambda f: ["verify", str(f), "--repair"], codes=(1, 2)),
 )
 
 

@@ -79,11 +79,11 @@ def read_all(place: str) -> int:
 
 VERBS: dict[str, Callable[[str], int]] = {
     "verify": lambda place: cli.run(["verify", place]),
-    "repair": lambda place: cli.run(["repair", place]),
+    "repair": lambda place: cli.run(["verify", place, "--repair"]),
     "status": lambda place: cli.run(["status", place]),
     "audit": lambda place: cli.run(["audit", place]),
     "show": lambda place: cli.run(["show", place, "--scene", "1", "--out", f"{place}.png"]),
-    "seal": lambda place: cli.run(["seal", place]),
+    "clean": lambda place: cli.run(["verify", place, "--clean"]),
     "read": read_all,
 }
 

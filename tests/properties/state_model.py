@@ -15,9 +15,7 @@ import numpy as np
 
 from datagen.schemas.fields import SCHEMAS, sized_schema
 from datagen.schemas.identity import sample_ids
-from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
-from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.specification import HeuristicParams, Specification
 from datagen.workers.labels import distance_visibility_score, load_label_source
 from tests.made_runs import small_spec, tables_of
@@ -118,16 +116,3 @@ def expected_rows(sealed: dict[tuple[int, str], Part]) -> tuple[Any, Any]:
 def drawn_rows(seed: int, shard: int) -> Any:
     spec = specification(seed, "")
     return tables_of(sized_schema("heuristic", spec), LAYOUT, seed, shard, hash_of(seed, ""))[1]
-
-
-def files_of_shard(run: Run, shard: int) -> dict[str, bytes]:
-    """The files of a shard as its attempt wrote them, made from the seed and the rule again."""
-    spec = run.manifest.spec
-    scenes, samples = tables_of(run.schema, LAYOUT, spec.seed, shard, run.manifest.spec_hash)
-    if spec.scenes_from is not None:
-        distances = (samples[k] for k in ("distance_m", "mount_distance_m", "arm_reach_m", "visibility"))
-        samples["heuristic_score"], samples["label"] = distance_visibility_score.heuristic(
-            *distances, spec.heuristic
-        )
-        samples["label_version"][:] = distance_visibility_score.VERSION
-    return encode_shard(run.schema, LAYOUT, run.manifest.spec_hash, scenes, samples)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,10 +23,10 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from datagen.cluster.run_recorder import close_lost_attempts
 from datagen.relabelling import relabel_all, relabelled_specification
 from datagen.schemas.checking.check_runs import Checked, check_runs
+from datagen.schemas.checking.cleaning import clean_runs
 from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
-from datagen.schemas.garbage_collection import find_garbage, sweep
 from datagen.schemas.keys import commit_key, shard_folder
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.merging import merge_runs, plan_merge
@@ -48,7 +47,6 @@ from tests.properties.state_model import (
     Part,
     Place,
     expected_rows,
-    files_of_shard,
     hash_of,
     specification,
     united,
@@ -206,8 +204,7 @@ class AnyHistory(RuleBasedStateMachine):
     def collect_garbage(self, data: st.DataObject) -> None:
         """What nobody committed goes, whatever its age; what counts stays."""
         place = self.draw_place(data)
-        for garbage in find_garbage(open_storage(place.folder, probe=False), 0.0, time.time() + 60):
-            sweep(garbage)
+        clean_runs(open_storage(place.folder, probe=False), kept_s=-60)
         for key, run in self.runs(place).items():
             folders = {"/".join(f.key.split("/")[:3]) for f in run.storage.list("shards")}
             assert len(folders) == len(place.parts[key].committed)
@@ -262,7 +259,7 @@ class AnyHistory(RuleBasedStateMachine):
 
     @rule(data=st.data())
     def damage_and_repair(self, data: st.DataObject) -> None:
-        """One bit of one committed file flips: it is found, and its bytes come back."""
+        """One bit of one committed file flips: it is found, its shard set aside, and made again."""
         place, key, run = self.draw_part(data)
         if not place.parts[key].committed:
             return
@@ -277,12 +274,17 @@ class AnyHistory(RuleBasedStateMachine):
         broken[bit // 8] ^= 1 << bit % 8
         run.storage.put(file, bytes(broken))  # a new file: what is linked elsewhere stays whole
         assert any(finding.key.endswith(entry.path) for finding in findings(place))
-        repaired = repair_runs(open_storage(place.folder, probe=False), files_of_shard)
-        assert not [f for f in repaired.left if f.is_damage]
-        if repaired.resealed:  # anew, over what is committed now
-            place.sealed = dict(place.parts)
-        assert run.storage.get(file, entry.size) == before
-        close_all(place)
+        repaired = repair_runs(open_storage(place.folder, probe=False))
+        assert repaired.left == [] and len(repaired.set_aside) == 1 and shard not in run.committed()
+        part = place.parts[key]
+        place.parts[key] = replace(part, committed=part.committed - {shard})
+        self.take_sealed(place)
+        if not key[1]:
+            name = self.attempt_name()
+            assert attempt(run, shard, name)
+            place.parts[key] = part
+            file = f"{shard_folder(shard, name)}/{entry.path}"
+            assert run.storage.get(file, entry.size) == before
 
     # What must hold ------------------------------------------------------------------------
 
@@ -312,6 +314,11 @@ class AnyHistory(RuleBasedStateMachine):
     def attempt_name(self) -> str:
         self.numbered += 1
         return f"t{self.numbered:05d}"
+
+    def take_sealed(self, place: Place) -> None:
+        """The store holds what is committed and planned now; there is none without any."""
+        held = any(part.committed & set(part.planned) for part in place.parts.values())
+        place.sealed = dict(place.parts) if held else None
 
     def draw_place(self, data: st.DataObject) -> Place:
         self.touched = data.draw(st.sampled_from(self.places))

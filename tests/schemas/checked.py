@@ -44,8 +44,3 @@ def sealed_run(folder: Path) -> Run:
 def folder_of(run: Run) -> Path:
     assert run.storage.folder is not None
     return run.storage.folder
-
-
-def no_shard_is_bad(*_: Any) -> dict[str, bytes]:
-    """Stands in for the function that makes a shard again, where none must be."""
-    raise AssertionError("no shard is bad")

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from datagen.schemas.checking.finding import Finding, Restore
+from datagen.schemas.checking.finding import Finding, Restore, SetAside
 from datagen.schemas.ledger import end_from_commit, lost_end
 from datagen.schemas.quarantine import lift_quarantine
 from datagen.schemas.record_files import decode_record
@@ -113,7 +113,7 @@ def test_an_end_and_a_start_that_are_both_damaged_are_two_findings(run: Run) -> 
     for key in keys:
         run.storage.put(key, b"{}")
     findings, _ = check(folder_of(run))
-    assert [(f.key, f.kind, f.cure) for f in findings] == [(key, "account", None) for key in keys]
+    assert [(f.key, f.kind, f.cure) for f in findings] == [(key, "account", SetAside()) for key in keys]
 
 
 def test_records_under_the_name_of_another_attempt(run: Run) -> None:

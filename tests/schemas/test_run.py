@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.record_files import copy_key, encode_record, publish, signed_json
+from datagen.schemas.record_files import copy_key, publish, signed_json
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import FileEntry, Layout, LedgerEntry, Plan, QuarantineRecord
+from datagen.schemas.run_records import FileEntry, Layout, LedgerEntry, QuarantineRecord
 from datagen.schemas.storage import open_storage
 from tests.made_runs import check_digests, commit_of, files_of, make_run, manifest_of, small_spec, write
 
@@ -44,15 +44,6 @@ def test_racing_plans_end_at_the_largest(tmp_path: Path):
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(run.grow, range(2, 22)))
     assert run.n == 21
-
-
-def test_a_plan_after_which_none_can_be_named_is_refused(tmp_path: Path):
-    run = make_run(tmp_path, n=1, shards=[])
-    (tmp_path / f"plans/{10**18 - 1}.json").write_bytes(encode_record(Plan(n=1, created="")))
-    with pytest.raises(
-        InputError, match=r"plans/9{18}\.json: is beyond the largest number of plans\. Move it out"
-    ):
-        run.grow(2)
 
 
 def test_the_existing_layout_wins(tmp_path: Path):

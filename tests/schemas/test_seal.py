@@ -19,9 +19,8 @@ from datagen.schemas import shard_files
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
-from datagen.schemas.sealing import SEALED, seal, sealed_metadata
+from datagen.schemas.sealing import SEALED, seal
 from datagen.schemas.sealing import local as seal_local
-from datagen.schemas.sealing.contents import read_contents
 from datagen.schemas.specification import Source
 from tests.made_runs import check_digests, files_of, make_run, rows_of, small_spec, write
 
@@ -307,13 +306,3 @@ def test_the_store_says_its_conventions_source_licences_and_coordinates(tmp_path
 def test_two_stores_of_one_specification_have_equal_metadata(tmp_path: Path):
     roots = [Path(seal(make_run(tmp_path / name, n=13).storage)) / "zarr.json" for name in "ab"]
     assert roots[0].read_bytes() == roots[1].read_bytes()
-
-
-def test_a_store_without_these_attributes_made_by_an_older_program_is_sound(tmp_path: Path):
-    run = make_run(tmp_path, n=13)
-    store = Path(seal(run.storage))
-    for path, data in sealed_metadata(read_contents(run.storage), for_readers=False).items():
-        (store / path).chmod(0o644)
-        (store / path).write_bytes(data)
-    assert list(check_runs(run.storage, Checked())) == []
-    assert "Conventions" not in xarray.open_zarr(store, chunks=None).attrs

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from datagen.schemas.checking.finding import Restore
+from datagen.schemas.checking.finding import Restore, SetAside
 from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, commit_copy_key, commit_key, part_folder
@@ -21,7 +21,7 @@ from datagen.schemas.sealing import seal
 from datagen.schemas.storage import open_storage
 from tests.faults.damage_campaign import fewer_arrays
 from tests.made_runs import attempt, make_run, small_spec
-from tests.schemas.checked import check, edit, folder_of, found, no_shard_is_bad, sealed_run
+from tests.schemas.checked import check, edit, folder_of, found, sealed_run
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -114,8 +114,9 @@ def test_plans_that_are_gone_or_shrink(tmp_path: Path):
     for key in ("plans/2.json", "copies/plans/2.json"):
         (folder / key).write_bytes((folder / "plans/1.json").read_bytes())
     assert found(folder) == [("record", "plans/2.json"), ("record", "copies/plans/2.json")]
-    for key in ("plans/2.json", "copies/plans/2.json"):  # as one that does not name its number
-        (folder / key).write_bytes(encode_record(Plan(n=10, created="")))
+    shrunk = Plan(n=10, created="", spec_hash=run.manifest.spec_hash, number=2)
+    for key in ("plans/2.json", "copies/plans/2.json"):
+        (folder / key).write_bytes(encode_record(shrunk))
     assert found(folder) == [("record", "plans/2.json")]
 
 
@@ -139,7 +140,7 @@ def test_a_commit_that_is_gone_with_its_copy_leaves_an_open_shard(sealed: Run):
     for key in (commit_key(1), commit_copy_key(1, "a-1")):
         (folder / key).unlink()
     (finding,), _ = check(folder)
-    assert (finding.kind, finding.key, finding.cure) == ("lost", commit_key(1), None)
+    assert (finding.kind, finding.key) == ("lost", commit_key(1)) and isinstance(finding.cure, SetAside)
     attempt(sealed, 1, "again")
     assert found(folder) == []
 
@@ -203,10 +204,10 @@ def test_an_end_without_a_start_and_a_start_of_a_decided_shard_without_an_end(se
     assert (finding.key, finding.kind) == ("ledger/x-1.json", "account")
 
 
-def test_an_account_that_is_damaged_and_known_from_nothing_else_cannot_be_repaired(sealed: Run):
+def test_a_damaged_end_record_without_a_commit_is_set_aside(sealed: Run):
     (folder_of(sealed) / "ledger/x-1.json").write_bytes(b"{}")
     (finding,), _ = check(folder_of(sealed))
-    assert (finding.kind, finding.cure) == ("account", None) and "remove it" in finding.fix
+    assert (finding.kind, finding.cure) == ("account", SetAside())
 
 
 def test_stages_that_take_longer_than_their_attempt(sealed: Run):
@@ -271,7 +272,7 @@ def test_a_sealed_root_with_an_empty_list_of_parts_is_found_and_sealed_again(mer
         (finding,), checked = check(folder)
         assert (finding.kind, finding.key) == ("sealed", "data.zarr/zarr.json")
         assert finding.problem == "names rows that no plan wants" and not checked.is_sealed
-        assert repair_runs(open_storage(folder), no_shard_is_bad).left == []
+        assert repair_runs(open_storage(folder)).left == []
         assert json.loads(path.read_text()) == whole and found(folder) == []
 
 

@@ -7,9 +7,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import chain
 
-from datagen.schemas.checking.commits import CheckedShard, check_account, check_commit
+from datagen.schemas.checking.attempts import (
+    CheckedShard,
+    LedgerTotals,
+    check_account,
+    check_commit,
+    check_quarantine,
+    check_rest,
+)
 from datagen.schemas.checking.finding import Finding, below
-from datagen.schemas.checking.ledger import LedgerTotals, check_quarantine, check_rest
 from datagen.schemas.checking.roots import check_notes, check_plans, open_roots
 from datagen.schemas.checking.sealed import SealedTally, check_chunks, check_store, read_root, runs_named
 from datagen.schemas.checking.shards import ShardForm, check_shard, form_of

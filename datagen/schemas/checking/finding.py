@@ -1,21 +1,27 @@
-"""A finding of a check: the file, the problem and the fix."""
+"""A finding of a check: the file, the problem and the fix; and the check of one record and its copy."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Generic, Literal, TypeVar
 
+from pydantic import BaseModel, ConfigDict
+
+from datagen.schemas.errors import InputError
+from datagen.schemas.record_files import MAX_RECORD_BYTES, REPAIR, decode_record, signed_json
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import FileEntry
+from datagen.schemas.storage import Storage
 
 # record: a JSON record is damaged, missing, or differs from its copy. account: the ledger is inconsistent.
 # file: a committed file is missing or has other bytes. rows: committed rows break the schema. lost: a
 # commit and its copy are missing. foreign: a file that no record names. sealed: data.zarr differs from
-# its shards. deep: recomputed rows differ. stale: data.zarr is older than its run.
-Kind = Literal["record", "account", "file", "rows", "lost", "foreign", "sealed", "deep", "stale"]
+# its shards. replay: a scene made again differs. stale: data.zarr is older than its run.
+Kind = Literal["record", "account", "file", "rows", "lost", "foreign", "sealed", "replay", "stale"]
 
-REPAIR = "Run datagen repair"
+BACKUP = "Restore the file from a backup"
+
+Record = TypeVar("Record", bound=BaseModel)
 
 
 @dataclass(frozen=True)
@@ -30,26 +36,18 @@ class Restore:
 
 
 @dataclass(frozen=True)
-class Regenerate:
-    """Compute the shard again; its file must have the committed size and digest."""
+class SetAside:
+    """Move the finding's shard of this run out of its records, or, without a run, the finding's file."""
 
-    run: Run
-    shard: int
-    entry: FileEntry
+    run: Run | None = None
 
 
 @dataclass(frozen=True)
 class Reseal:
-    """Seal again; or, where that cannot be done in one step, repair this file of the store.
-
-    The file is a copy of `source`, or has these bytes, or must not exist.
-    """
-
-    source: str = ""
-    data: bytes | None = None
+    """Make data.zarr again."""
 
 
-Cure = Restore | Regenerate | Reseal
+Cure = Restore | SetAside | Reseal
 
 
 @dataclass(frozen=True)
@@ -75,5 +73,67 @@ def below(prefix: str, findings: Iterable[Finding]) -> Iterator[Finding]:
 
 
 def curable(key: str, kind: Kind, problem: str, cure: Cure, shard: int | None = None) -> Finding:
-    """A finding that `datagen repair` fixes."""
+    """A finding that `datagen verify --repair` fixes."""
     return Finding(key, kind, problem, REPAIR, shard, cure)
+
+
+class AnyRecord(BaseModel):
+    """A record of which only the signature is checked, since no data depends on it."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+@dataclass(frozen=True, eq=False)
+class Read(Generic[Record]):
+    """One record file: its bytes, if any, and the record or its problem."""
+
+    key: str
+    data: bytes | None
+    record: Record | None
+    problem: str
+
+
+def read(
+    storage: Storage, key: str, model: type[Record], refuse: Callable[[Record], str] = lambda record: ""
+) -> Read[Record]:
+    """Read a record; bad content does not raise.
+
+    `refuse` returns the problem of an otherwise valid record, or "".
+    """
+    try:
+        data = storage.get(key, MAX_RECORD_BYTES)
+    except InputError as error:
+        return Read(key, None, None, error.problem)
+    if data is None:
+        return Read(key, None, None, "missing")
+    try:
+        record = decode_record(key, data, model)
+    except InputError as error:
+        return Read(key, data, None, f"{error.field}: {error.problem}" if error.field else error.problem)
+    if signed_json(record.model_dump(mode="json", exclude_unset=True)) != data:
+        return Read(key, data, None, "signed, but not in the form that datagen writes")
+    problem = refuse(record)
+    return Read(key, data, None if problem else record, problem)
+
+
+def compare(
+    ours: Read[Record], copy: Read[Record], shard: int | None = None, fix: str = BACKUP
+) -> list[Finding]:
+    """Check a record and its second copy; each restores the other.
+
+    `fix` is the fix where both are valid but differ.
+    """
+    if ours.record is not None and copy.record is not None:
+        if ours.data == copy.data:
+            return []
+        return [Finding(ours.key, "record", f"differs from its copy {copy.key}", fix, shard)]
+    for bad, good in ((copy, ours), (ours, copy)):
+        if good.record is not None and good.data is not None:
+            return [curable(bad.key, "record", bad.problem, Restore(good.data), shard)]
+    damaged = [one for one in (ours, copy) if one.problem != "missing"]
+    return [Finding(one.key, "record", f"{one.problem}, as is its copy", BACKUP, shard) for one in damaged]
+
+
+def sound(ours: Read[Record], copy: Read[Record]) -> Record | None:
+    """The record from whichever of the two files is undamaged."""
+    return ours.record if ours.record is not None else copy.record

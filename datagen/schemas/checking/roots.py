@@ -5,8 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from datagen.schemas.checking.finding import Finding, Restore, below, curable
-from datagen.schemas.checking.records import AnyRecord, compare, read, sound
+from datagen.schemas.checking.finding import (
+    AnyRecord,
+    Finding,
+    Restore,
+    SetAside,
+    below,
+    compare,
+    curable,
+    read,
+    sound,
+)
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.lineage import LINEAGE, Lineage
@@ -146,7 +155,6 @@ def check_notes(storage: Storage) -> Iterator[Finding]:
     lineage, copy = read(storage, LINEAGE, Lineage), read(storage, copy_key(LINEAGE), Lineage)
     if {lineage.problem, copy.problem} != {"missing"}:
         yield from compare(lineage, copy, fix=_BROKEN_OFF)
-    fix = "Restore the file from a backup, or remove it: no sample depends on it"
     for file in storage.list("jobs"):
         if file.key.endswith(".json") and (problem := read(storage, file.key, AnyRecord).problem):
-            yield Finding(file.key, "record", problem, fix)
+            yield curable(file.key, "record", problem, SetAside())

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from hashlib import sha256
 
-from datagen.schemas.checking.commits import CheckedShard
+from datagen.schemas.checking.attempts import CheckedShard
 from datagen.schemas.checking.finding import Finding, Reseal, curable
 from datagen.schemas.checking.shards import ShardForm, same_json
 from datagen.schemas.errors import InputError
@@ -112,7 +112,7 @@ def check_chunks(
             if entry is None or _is_link(storage, key, f"{folder}/{path}"):
                 continue
             if problem := _other_bytes(storage, key, min(entry.size, form.most_bytes(path)), entry.sha256):
-                yield curable(key, "sealed", problem, Reseal(source=f"{folder}/{path}"), commit.shard)
+                yield curable(key, "sealed", problem, Reseal(), commit.shard)
 
 
 def _is_link(storage: Storage, key: str, source: str) -> bool:
@@ -146,31 +146,28 @@ def check_store(
     if tally.unknown:
         problem = f"holds {tally.unknown} shards without any file in the run"
         yield curable(SEALED, "sealed", problem, Reseal())
-    if tally.lost:  # their rows exist only here: do not seal again
+    if tally.lost:
         problem = f"holds {tally.lost} shards whose commits are lost: it cannot be checked"
-        fix = "Make the shards again with `datagen resume`, which seals them with the others"
-        yield Finding(SEALED, "sealed", problem, fix)
+        yield curable(SEALED, "sealed", problem, Reseal())
     if tally.unknown or tally.lost:
         return
     parts = tuple(sealed.values())
     first, digests = parts[0].run, (tally.digest.hexdigest(),)
     contents = Contents(storage, parts, tuple(tally.shards), digests, first.schema, first.layout)
-    older = sealed_metadata(contents, for_readers=False)
     for path, data in sealed_metadata(contents).items():
         key = f"{SEALED}/{path}"
         try:
             there = storage.get(key, MAX_RECORD_BYTES)
             problem = "missing" if there is None else ""
-            if there is not None and not (same_json(there, data) or same_json(there, older[path])):
+            if there is not None and not same_json(there, data):
                 problem = "differs from what sealing these shards writes"
         except InputError as error:
             problem = error.problem
         if problem:
-            yield curable(key, "sealed", problem, Reseal(data=data))
+            yield curable(key, "sealed", problem, Reseal())
     yield from _foreign_files(contents)
     if any(_is_behind(run, wanted[run.manifest.spec_hash], sealed) for run in runs):
-        fix = "Run datagen seal to update it; nothing is damaged"
-        yield Finding(SEALED, "stale", "is older than the committed shards", fix)
+        yield curable(SEALED, "stale", "is older than the committed shards; nothing is damaged", Reseal())
 
 
 def _is_behind(run: Run, n: int, sealed: Mapping[str, SealedRun]) -> bool:

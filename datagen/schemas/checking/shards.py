@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from datagen.schemas.checking.finding import Finding, Regenerate, curable
+from datagen.schemas.checking.finding import Finding, SetAside, curable
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import Field, RecordSchema, Table
 from datagen.schemas.identity import sample_ids
@@ -23,7 +23,6 @@ from datagen.schemas.shard_files import MAX_TEXT_BYTES, chunk_paths, group_metad
 from datagen.schemas.shard_reading import MAX_META_BYTES, Array, StoredArray, decode_chunk, parse_metadata
 from datagen.schemas.storage import StoredFile
 
-_WRONG_FIX = "It is undamaged but wrong: remove the commit and its copy, and `datagen resume` makes it again"
 # Arrays that are checked together; every other array is checked by itself.
 _KEYS = ("scene_index", "redraws", "sample_id", "sample_scene_index", "candidate_index", "label")
 
@@ -63,22 +62,25 @@ def form_of(run: Run) -> ShardForm:
 def check_shard(run: Run, form: ShardForm, commit: Commit, listed: Mapping[str, StoredFile]) -> list[Finding]:
     """Check every file of a committed shard against its entry, and the rows against the schema.
 
-    `listed` are the files below the attempt's folder; drafts of killed writers (.part) are left to `gc`.
+    `listed` are the files below the attempt's folder; drafts of killed writers (.part) are garbage.
     Holds at most one shard's arrays in memory.
     """
     folder, shard = shard_folder(commit.shard, commit.attempt), commit.shard
     entries = {entry.path: entry for entry in commit.files}
     findings: list[Finding] = []
+
+    def wrong(key: str, problem: str) -> None:
+        """Rows or files that are as committed, but not those of this shard."""
+        findings.append(curable(key, "rows", problem, SetAside(run), shard))
+
     if odd := sorted(form.paths ^ entries.keys()):
         problem = f"files: {len(odd)} missing or extra, first {odd[0]}"
-        findings.append(Finding(commit_key(shard), "rows", problem, _WRONG_FIX, shard))
+        wrong(commit_key(shard), problem)
     known = {f"{folder}/{path}" for path in ("commit.json", *entries)}
     for key in listed:
         if key not in known and not key.endswith(".part"):
             problem = "is in a committed attempt's folder, but in no record"
-            findings.append(
-                Finding(key, "foreign", problem, "Move it out of the run: nothing reads it", shard)
-            )
+            findings.append(curable(key, "foreign", problem, SetAside(), shard))
 
     def read(paths: Iterable[str]) -> dict[str, bytes]:
         """The bytes of committed files; missing and changed ones become findings."""
@@ -92,8 +94,7 @@ def check_shard(run: Run, form: ShardForm, commit: Commit, listed: Mapping[str, 
 
     for path, data in read(form.metadata).items():
         if not same_json(data, form.metadata[path]):
-            problem = "differs from the metadata of the schema"
-            findings.append(Finding(f"{folder}/{path}", "rows", problem, _WRONG_FIX, shard))
+            wrong(f"{folder}/{path}", "differs from the metadata of the schema")
     kept: dict[str, Array] = {}
     whole = True
     for table, field in form.schema.fields:
@@ -103,14 +104,14 @@ def check_shard(run: Run, form: ShardForm, commit: Commit, listed: Mapping[str, 
         if len(chunks) == len(paths):
             values, problem = _decode(run, form, table, field, list(chunks.values()))
         if problem:
-            findings.append(Finding(f"{folder}/{field.name}", "rows", problem, _WRONG_FIX, shard))
+            wrong(f"{folder}/{field.name}", problem)
         if values is None:
             whole = False
         elif field.name in _KEYS:
             kept[field.name] = values
     if whole:
         for name, problem in _row_problems(run, commit, kept):
-            findings.append(Finding(f"{folder}/{name}", "rows", problem, _WRONG_FIX, shard))
+            wrong(f"{folder}/{name}", problem)
     return findings
 
 
@@ -121,7 +122,7 @@ def _bytes_of(
     key = f"{shard_folder(commit.shard, commit.attempt)}/{entry.path}"
     if entry.size > form.most_bytes(entry.path):
         problem = f"has {entry.size} bytes by its commit, more than such a file can have"
-        return None, Finding(key, "rows", problem, _WRONG_FIX, commit.shard)
+        return None, curable(key, "rows", problem, SetAside(run), commit.shard)
     data, problem = None, "missing"
     if there is not None and there.size != entry.size:
         problem = f"has {there.size} bytes, but {entry.size} were committed"
@@ -134,7 +135,7 @@ def _bytes_of(
         if sha256(data).hexdigest() == entry.sha256:
             return data, None
         problem = "sha256: differs from the committed bytes"
-    return None, curable(key, "file", problem, Regenerate(run, commit.shard, entry), commit.shard)
+    return None, curable(key, "file", problem, SetAside(run), commit.shard)
 
 
 def same_json(data: bytes, wanted: bytes) -> bool:

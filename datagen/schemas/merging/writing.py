@@ -103,10 +103,8 @@ def _link(union: Union, run: Run, holding: Holding) -> bool:
     folder = shard_folder(holding.shard, holding.attempt)
     keys = [f"{folder}/{entry.path}" for entry in commit.files]
     largest = max((entry.size for entry in commit.files), default=0)
-    # Another merge may have committed this attempt.
-    with run.nothing_left_behind(holding.shard, holding.attempt):
-        run.storage.adopt_many(source.storage, zip(keys, keys, strict=True), largest)
-        run.storage.sync(keys)
+    run.storage.adopt_many(source.storage, zip(keys, keys, strict=True), largest)
+    run.storage.sync(keys)
     return run.commit(commit)
 
 

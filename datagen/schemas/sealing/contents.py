@@ -11,6 +11,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import Field, RecordSchema, Table
 from datagen.schemas.keys import part_folder, shard_folder
 from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.record_files import REPAIR
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, Layout
 from datagen.schemas.shard_files import chunk_key, chunk_paths, group_metadata, rows_per_shard
@@ -191,5 +192,5 @@ def _refuse_odd_files(run: Run, commit: Commit, expected: frozenset[str]) -> Non
             f"{run.storage.url}/{shard_folder(commit.shard, commit.attempt)}",
             "files",
             f"{len(odd)} files are missing or extra, first {odd[0]}",
-            "Repair it with `datagen repair`",
+            REPAIR,
         )

@@ -62,7 +62,7 @@ def unseal_folder(folder: Path) -> None:
 
 
 def draft_of(folder: Path) -> Path:
-    """A new name for an incomplete or replaced store; `gc` removes such names."""
+    """A new name for an incomplete or replaced store; `verify --clean` removes such names."""
     return folder / f"{SEALED}.{secrets.token_hex(8)}.partial"
 
 

@@ -55,11 +55,8 @@ def sealed_root(storage: Storage) -> SealedRoot | None:
         return None
 
 
-def sealed_metadata(contents: Contents, for_readers: bool = True) -> dict[str, bytes]:
-    """zarr.json files of the store by path; the root's has consolidated metadata.
-
-    Older stores are not `for_readers`: they lack the attributes of CF and ACDD.
-    """
+def sealed_metadata(contents: Contents) -> dict[str, bytes]:
+    """zarr.json files of the store by path; the root's has consolidated metadata."""
     first = contents.runs[0]
     attributes = root_attributes(contents.schema, contents.layout, first.run.manifest.spec_hash)
     if contents.is_merged:
@@ -69,11 +66,9 @@ def sealed_metadata(contents: Contents, for_readers: bool = True) -> dict[str, b
         attributes |= _part(first)
     attributes["rows_sha256"] = contents.digests[-1]
     rows = {table: contents.rows(table) for table in TABLES}
-    of_arrays: dict[str, dict[str, Any]] = {}
-    if for_readers:
-        specs = [part.run.manifest.spec for part in contents.runs]
-        attributes = described(specs, [part.n for part in contents.runs]) | attributes
-        of_arrays = {f.name: cf_attributes(f, table) for table, f in contents.schema.fields}
+    specs = [part.run.manifest.spec for part in contents.runs]
+    attributes = described(specs, [part.n for part in contents.runs]) | attributes
+    of_arrays = {f.name: cf_attributes(f, table) for table, f in contents.schema.fields}
     files = zarr_metadata(contents.schema, contents.layout, rows, attributes, of_arrays)
     make = default_buffer_prototype().buffer.from_bytes
     store = {path: make(data) for path, data in files.items()}

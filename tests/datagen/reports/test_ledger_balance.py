@@ -73,7 +73,7 @@ def test_a_broken_record_is_named_by_the_audit(run: Run, capsys: pytest.CaptureF
     assert cli.run(["audit", run.storage.url]) == 1
     told = capsys.readouterr().out
     assert told.startswith("sums differ for 1 record") and "ledger/a-1.json" in told
-    assert cli.run(["repair", run.storage.url]) == 0
+    assert cli.run(["verify", run.storage.url, "--repair"]) == 0
     assert balance([Run.open(run.storage)]).is_exact
 
 

@@ -1,1 +1,0 @@
-"""Make shards and scenes again from their records, for checks, repairs and replays."""
