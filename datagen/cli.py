@@ -27,6 +27,7 @@ from datagen.cluster.environment import job_environment
 from datagen.console.command_lines import PRINTER, Interrupted, begin_with_process
 from datagen.schemas.errors import InputError, one_line, refuse_not_utf8
 from datagen.workers.extras import missing_library
+from datagen.workers.registry import allow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -170,6 +171,7 @@ def run(arguments: Sequence[str]) -> int:
     Defects of this program are not caught: a bug report needs their traceback.
     """
     verb = next(iter(arguments), "")
+    allow(arguments)
     try:
         code = _call(build_app(verb), [refuse_not_utf8(word) for word in arguments])
         sys.stdout.flush()

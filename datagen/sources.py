@@ -8,6 +8,7 @@ from typing import Generic, TypeVar
 from datagen.workers.houses import HOUSE_SOURCES, open_houses
 from datagen.workers.labels import LABEL_SOURCES, load_label_source
 from datagen.workers.objects import OBJECT_SOURCES, open_objects
+from datagen.workers.registry import allow
 from datagen.workers.robots import ROBOTS, robot_limits
 
 T = TypeVar("T")
@@ -17,7 +18,7 @@ class Registry(Generic[T]):
     """Names, each with an object that is loaded on access.
 
     `list(registry)` gives the names, and `registry[name]` loads one. An unknown name raises InputError with
-    the valid ones.
+    the valid ones. A name may also be `module:attribute` outside the package.
 
     Example:
         >>> list(datagen.robots)
@@ -32,6 +33,7 @@ class Registry(Generic[T]):
         self._entries, self._load = entries, load
 
     def __getitem__(self, name: str) -> T:
+        allow([name])
         return self._load(name)
 
     def __iter__(self) -> Iterator[str]:

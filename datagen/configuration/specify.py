@@ -28,6 +28,7 @@ from datagen.workers.extras import how_to_get, versions_of
 from datagen.workers.houses.house import HouseSource
 from datagen.workers.labels import load_label_source
 from datagen.workers.objects.model import ObjectSource
+from datagen.workers.registry import allow, entry
 from datagen.workers.rendering import RENDERERS, load_renderer
 from datagen.workers.robots import ROBOTS, robot_limits
 from datagen.workers.scenes import scenes_version
@@ -247,8 +248,9 @@ def complete_arm(
             raise InputError(place, f"arm.{section}", problem, "Remove the section, or submit sim")
     if robot is not None:
         arm["robot"] = robot
-    elif isinstance(named := arm.get("robot"), str) and named not in ROBOTS:
-        raise InputError(place, "arm.robot", f"{named!r} is unknown", choices(ROBOTS, str(named)))
+    elif isinstance(named := arm.get("robot"), str):
+        allow([named])  # from the user's own file
+        entry(ROBOTS, named, f"{place}: arm.robot")
     if label_source == "sim":
         arm.setdefault("trial", {})
     if repeats is not None:

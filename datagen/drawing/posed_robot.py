@@ -11,7 +11,6 @@ from datagen.workers.geometry.mesh import F64, I32, Mesh
 from datagen.workers.geometry.transforms import inverse, translation
 from datagen.workers.rendering.embree import RayMesh, ray_mesh
 from datagen.workers.robots.robot import Robot
-from datagen.workers.robots.urdf import read_urdf
 
 _PEDESTAL_RGB, _PEDESTAL_SIDES = (196, 205, 216), 24
 _FINGER_RGB = (0, 185, 200)  # rare among objects, so that the fingers are visible
@@ -49,10 +48,7 @@ class RobotBodies:
 
 def robot_bodies(robot: Robot, pedestal_radius_m: float) -> RobotBodies:
     """The robot's bodies, with a pedestal for robots without a base of their own."""
-    tree = read_urdf(robot.urdf)
-    sides = {
-        tree.joint(name).child: side for name, side in zip(robot.finger_joint_names, (1, -1), strict=True)
-    }
+    sides = dict(zip(robot.link_names[-2:], (1, -1), strict=True))
     meshes, links, fingers = [], [], []
     for k, (name, mesh) in enumerate(zip(robot.link_names, robot.link_meshes(), strict=True)):
         if len(mesh.faces):

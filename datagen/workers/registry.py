@@ -1,41 +1,64 @@
 """Registries: dictionaries from a name to `module:attribute`, imported on first use.
 
 `datagen --help` therefore imports no simulator, and a machine without the system libraries of one engine
-can use another.
+can use another. A name that is itself `module:attribute` is an entry outside the package.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import re
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from typing import Any
 
 from datagen.schemas.errors import InputError, choices
 from datagen.workers.extras import missing_library
 
+# Entries outside the package that this process and its workers may import, separated by spaces. Runs and
+# checkpoints from elsewhere contain names too, and those must not import anything.
+ALLOWED = "DATAGEN_ALLOW"
+_OUTSIDE = re.compile(r"([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*:[A-Za-z_]\w*)(?::.*)?", re.DOTALL)
+
+
+def allow(words: Iterable[str]) -> None:
+    """Allow the entries outside the package among words that the user wrote: names, references, options."""
+    found = [match[1] for word in words if (match := _OUTSIDE.fullmatch(word.rpartition("=")[2]))]
+    os.environ[ALLOWED] = " ".join(dict.fromkeys([*os.environ.get(ALLOWED, "").split(), *found]))
+
 
 def entry(registry: Mapping[str, str], name: str, option: str) -> Any:
-    """Return the entry of a registry. `option` is the command-line option to name in errors.
+    """Return an entry of a registry, or one outside the package that is allowed.
 
-    Raises InputError for an unknown name, listing the valid ones, and for an engine that cannot be
-    imported on this machine.
+    `option` is the command-line option to name in errors. Raises InputError for an unknown name, listing the
+    valid ones, for one outside that is not allowed, and for one that cannot be imported on this machine.
     """
+    target = registry.get(name, name)
     if name not in registry:
-        raise InputError(option, name or "''", "is unknown", choices(registry, name))
-    module, attribute = registry[name].split(":")
+        if not _OUTSIDE.fullmatch(name):
+            raise InputError(option, name or "''", "is unknown", choices(registry, name))
+        if name not in os.environ.get(ALLOWED, "").split():
+            fix = f"Set {ALLOWED}={name} if you trust this code, or {choices(registry).lower()}"
+            raise InputError(option, name, "is outside the package, and not named by you", fix)
+    place, attribute = target.split(":")
     try:
-        return getattr(import_module(module), attribute)
+        module = import_module(place)
     except ImportError as error:
+        if name not in registry and error.name == place:
+            raise InputError(option, name, "is unknown", choices(registry, name)) from None
         others = f"choose another one: {', '.join(sorted(set(registry) - {name}))}"
         if missing := missing_library(error):
             problem = f"needs {missing.place}, which is not installed"
             raise InputError(option, name, problem, f"{missing.fix}. Or {others}") from error
         fix = f"Run `datagen doctor`, or {others}"
         raise InputError(option, name, f"cannot be imported here: {error}", fix) from error
+    if not hasattr(module, attribute):
+        raise InputError(option, name, f"{place} has no {attribute}", "Name one of its attributes")
+    return getattr(module, attribute)
 
 
 def open_source(registry: Mapping[str, str], ref: str, option: str) -> Any:
-    """Open the source of a reference `kind` or `kind:text`.
+    """Open the source of a reference: `kind`, `kind:text`, or `module:attribute:text` outside the package.
 
     Raises InputError as `entry` does, and for a folder without a kind.
     """
@@ -43,6 +66,9 @@ def open_source(registry: Mapping[str, str], ref: str, option: str) -> Any:
     if kind not in registry and "/" in kind:
         fix = f"Write KIND:{ref}, where KIND is one of {', '.join(sorted(registry))}"
         raise InputError(option, ref, "is a folder without the kind of its content", fix)
+    if kind not in registry and (outside := _OUTSIDE.fullmatch(ref)):
+        kind = outside[1]
+        text = ref[len(kind) + 1 :]
     return entry(registry, kind, option)(text)
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 # Houses are drawn at random, so few are seen twice in a row; this bounds a worker's memory.
 _HOUSES_KEPT = 16
-_TARGETS = CacheFolder("targets", {"names": (np.str_, ("objects",))}, most_files=64, most_bytes=2**20)
+_TARGETS = CacheFolder("targets", most_files=64)
 
 
 @dataclass(frozen=True, eq=False)

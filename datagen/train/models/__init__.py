@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from datagen.schemas.errors import InputError, choices
 from datagen.train.models.model import Model, fast
 from datagen.train.models.n2m import N2mModel
 from datagen.train.models.paper import PaperModel
 from datagen.train.models.shared import SharedModel
+from datagen.workers.registry import entry
 
 MODELS: dict[str, Callable[[Mapping[str, Any]], Model]] = {
     "paper": PaperModel,
@@ -21,11 +21,11 @@ MODELS: dict[str, Callable[[Mapping[str, Any]], Model]] = {
 def build_model(name: str, config: Mapping[str, Any]) -> Model:
     """Build the model of that name with new parameters from torch's global generator.
 
-    Fields of `config` have defaults. InputError names an unknown model or field, or a value out of range.
+    Fields of `config` have defaults. The name may be `module:attribute` outside the package. InputError names
+    an unknown model or field, or a value out of range.
     """
-    if name not in MODELS:
-        raise InputError("model", name, "is unknown", choices(MODELS, name))
-    return MODELS[name](config)
+    build = MODELS[name] if name in MODELS else entry(dict.fromkeys(MODELS, ""), name, "--model")
+    return build(config)
 
 
 __all__ = ["MODELS", "Model", "build_model", "fast"]

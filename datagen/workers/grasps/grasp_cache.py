@@ -15,9 +15,9 @@ import numpy.typing as npt
 
 from datagen.schemas.identity import digest_of
 from datagen.schemas.specification import GraspParams
-from datagen.workers.content_cache import Arrays, CacheFolder
+from datagen.workers.content_cache import CacheFolder
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.grasps.search import BLOCK, VERSION, HandPoses, hand_poses_of, score_block, score_poses
+from datagen.workers.grasps.search import BLOCK, VERSION, HandPoses, hand_poses_of, score_block
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.description import Gripper, Parts
 
@@ -27,8 +27,7 @@ class GraspSet:
     """G grasps, best first. The TCP frame is the gripper's (`datagen.workers.robots.description.Gripper`).
 
     Scores are shares of floating-hand pulls that held, 0 to 1. The scores of the first S grasps are known and
-    at least `min_score`. Each other score is computed on first use and may be lower. `pose_score` gives that
-    of any pose (4, 4) in the object's frame and opening.
+    at least `min_score`. Each other score is computed on first use and may be lower.
     """
 
     T_object_tcp: F64  # (G, 4, 4)
@@ -36,7 +35,6 @@ class GraspSet:
     score: F32  # (S,)
     min_score: float = 0.0
     later_score: Callable[[int], float] | None = None  # by row - S
-    pose_score: Callable[[F64, float], float] | None = None
 
     def __len__(self) -> int:
         return len(self.opening_m)
@@ -52,35 +50,13 @@ class GraspSet:
         """Whether the grasp has at least `min_score`."""
         return row < len(self.score) or self.score_of(row) >= self.min_score
 
-    def with_poses(self, T_object_tcp: F64, opening_m: F64) -> GraspSet:
-        """Other poses (G, 4, 4) of the hand at the same object, none of them scored yet."""
-        pose_score = self.pose_score
-        assert pose_score is not None
-
-        def later_score(row: int) -> float:
-            return pose_score(T_object_tcp[row], float(opening_m[row]))
-
-        openings = opening_m.astype(np.float32)
-        return GraspSet(T_object_tcp, openings, self.score[:0], self.min_score, later_score, pose_score)
-
 
 Bools = npt.NDArray[np.bool_]
 
 _NO_SCORE = np.zeros(0, np.float32)
 _KEPT_IN_MEMORY = 128
-_POSES = CacheFolder(
-    "hand-poses",
-    {
-        "T_object_tcp": (np.float64, ("n", 4, 4)),
-        "opening_m": (np.float64, ("n",)),
-        "is_clear": (np.bool_, ("n",)),
-        "n_tried": (np.int64, ()),
-        "reason": (np.str_, ()),
-    },
-    most_files=1024,  # of some 250 KB each
-    most_bytes=20_000_000,
-)
-_SCORES = CacheFolder("grasps", {"score": (np.float32, ("n",))}, most_files=65_536, most_bytes=10_000)
+_POSES = CacheFolder("hand-poses", most_files=1024)  # of some 250 KB each
+_SCORES = CacheFolder("grasps", most_files=65_536)
 # Grasps of an object that are scored in advance; the others only when an arm has a plan to them.
 SCORED_FIRST = 128
 # Most searches of one object; fewer where they find enough poses.
@@ -91,16 +67,13 @@ _ENGINES = ("sapien", "coal", "scipy", "numpy")
 
 @dataclass(frozen=True, eq=False)
 class ScoredGrasps:
-    """The first G poses of one object, in order, with their scores. Where G is 0, `reason` is the cause."""
+    """The first G poses of one object, in order, with their scores."""
 
     T_object_tcp: F64  # (G, 4, 4)
     opening_m: F32  # (G,)
     score: F32  # (G,), share of floating-hand pulls that held
     is_clear: Bools  # (G,), the hand stays above the plane that the upright object stands on
-    n_tried: int  # poses of the first search that were checked against the object
-    n_free: int  # of these, the hand does not touch the object
-    n_clear: int  # of the free ones, the hand stays above that plane
-    reason: str
+    n_clear: int  # poses of the first search in which it does
 
     def __len__(self) -> int:
         return len(self.score)
@@ -154,17 +127,8 @@ def grasps_of(model: ObjectModel, gripper: Gripper, params: GraspParams, draw: i
         search, row = later[k]
         return float(_score(known, digest, model, gripper, search, row // BLOCK)[row % BLOCK])
 
-    def pose_score(T_object_tcp: F64, opening_m: float) -> float:
-        rng = _generator([digest, T_object_tcp.tolist(), opening_m])
-        return float(score_poses(model, gripper, T_object_tcp[None], np.array([opening_m]), rng)[0])
-
     found = GraspSet(
-        np.concatenate(T),
-        np.concatenate(openings),
-        first.score[rows],
-        params.min_score,
-        later_score,
-        pose_score,
+        np.concatenate(T), np.concatenate(openings), first.score[rows], params.min_score, later_score
     )
     known.sets[key] = found
     return found
@@ -192,17 +156,12 @@ def scored_grasps(model: ObjectModel, gripper: Gripper, n: int, draw: int = 0) -
         left -= some
         if left == 0 or len(poses) == 0:
             break
-    first, score = known.searches[0], np.concatenate(scores)
-    reason = first.reason or ("" if score.any() else "no grasp holds the object")
     return ScoredGrasps(
         np.concatenate(T),
         np.concatenate(openings).astype(np.float32),
-        score,
+        np.concatenate(scores),
         np.concatenate(clear),
-        first.n_tried,
-        len(first),
-        int(first.is_clear.sum()),
-        reason,
+        int(known.searches[0].is_clear.sum()),
     )
 
 
@@ -232,11 +191,10 @@ def _poses(known: _Known, digest: str, model: ObjectModel, gripper: Gripper, sea
     if search == len(known.searches):
         key = _file_digest([digest, search])
         stored = _POSES.load(key)
-        found = None if stored is None else _restored(stored)
-        if found is None:
-            found = hand_poses_of(model, gripper, _generator([digest, search]))
-            _POSES.store(key, _stored(found))
-        known.searches.append(found)
+        if stored is None:
+            stored = vars(hand_poses_of(model, gripper, _generator([digest, search])))
+            _POSES.store(key, stored)
+        known.searches.append(HandPoses(**stored))
     return known.searches[search]
 
 
@@ -245,11 +203,11 @@ def _score(known: _Known, digest: str, model: ObjectModel, gripper: Gripper, sea
         poses = known.searches[search]
         key = _file_digest([digest, search, block])
         stored = _SCORES.load(key)
-        score = None if stored is None else stored["score"]
-        if score is None or not _are_scores(score, min(BLOCK, len(poses) - block * BLOCK)):
-            score = score_block(model, gripper, poses, block, _generator([digest, search, block]))
-            _SCORES.store(key, {"score": score})
-        known.scores[search, block] = score
+        if stored is None:
+            rng = _generator([digest, search, block])
+            stored = {"score": score_block(model, gripper, poses, block, rng)}
+            _SCORES.store(key, stored)
+        known.scores[search, block] = stored["score"]
     return known.scores[search, block]
 
 
@@ -276,31 +234,3 @@ def _version_of(package: str) -> str:
         return version(package)
     except PackageNotFoundError:  # installed without metadata, as conda packages can be
         return ""
-
-
-def _stored(found: HandPoses) -> Arrays:
-    return {
-        "T_object_tcp": found.T_object_tcp,
-        "opening_m": found.opening_m,
-        "is_clear": found.is_clear,
-        "n_tried": np.array(found.n_tried, np.int64),
-        "reason": np.array(found.reason),
-    }
-
-
-def _restored(stored: Arrays) -> HandPoses | None:
-    found = HandPoses(
-        stored["T_object_tcp"],
-        stored["opening_m"],
-        stored["is_clear"],
-        int(stored["n_tried"]),
-        str(stored["reason"]),
-    )
-    R = found.T_object_tcp[:, :3, :3]
-    are_rotations = np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-6)
-    finite = np.isfinite(found.T_object_tcp).all() and np.isfinite(found.opening_m).all()
-    return found if are_rotations and finite else None
-
-
-def _are_scores(score: F32, n: int) -> bool:
-    return len(score) == n and bool(((score >= 0) & (score <= 1)).all())

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import coal
@@ -47,16 +48,11 @@ _CLEAR_IN_FOUR = 3  # clear poses among four in a row, where there are enough of
 
 @dataclass(frozen=True, eq=False)
 class HandPoses:
-    """N poses in which the hand does not touch the object. The first n, for any n, are spread over it.
-
-    Where N is 0, `reason` is the cause.
-    """
+    """N poses in which the hand does not touch the object. The first n, for any n, are spread over it."""
 
     T_object_tcp: F64  # (N, 4, 4)
     opening_m: F64  # (N,)
     is_clear: Bools  # (N,), the hand stays above the plane that the upright object stands on
-    n_tried: int  # poses checked against the object
-    reason: str
 
     def __len__(self) -> int:
         return len(self.opening_m)
@@ -65,21 +61,16 @@ class HandPoses:
 def hand_poses_of(model: ObjectModel, gripper: Gripper, rng: np.random.Generator) -> HandPoses:
     """All hand poses around an object that one search finds: a few hundred to two thousand.
 
-    An object that cannot be grasped, or whose parts have no volume, gives no poses and a reason.
+    An object that cannot be grasped, or whose parts have no volume, gives no poses.
     """
-    if not model.convex_parts_m or not all(np.isfinite(part).all() for part in model.convex_parts_m):
-        return _none(0, "no collision parts, or a corner that is not finite")
-    try:
-        T, opening_m, n_tried = _free_poses(model, gripper, rng)
-    except QhullError:
-        return _none(0, "a collision part has no volume")
-    if n_tried == 0:
-        return _none(0, "no two opposite sides are near enough for the fingers")
-    if len(T) == 0:
-        return _none(n_tried, "the hand touches the object in every pose")
+    parts = model.convex_parts_m
+    T, opening_m = np.zeros((0, 4, 4)), np.zeros(0)
+    if parts and all(np.isfinite(part).all() for part in parts):
+        with suppress(QhullError):  # a part without volume
+            T, opening_m = _free_poses(model, gripper, rng)
     is_clear = _is_clear(model, gripper, T, opening_m)
     order = _spread(T, is_clear)
-    return HandPoses(T[order], opening_m[order], is_clear[order], n_tried, "")
+    return HandPoses(T[order], opening_m[order], is_clear[order])
 
 
 def score_block(
@@ -87,24 +78,18 @@ def score_block(
 ) -> F32:
     """Shares (n,) of the pulls that the poses of one block hold, n <= `BLOCK`."""
     rows = slice(block * BLOCK, (block + 1) * BLOCK)
-    return score_poses(model, gripper, poses.T_object_tcp[rows], poses.opening_m[rows], rng)
-
-
-def score_poses(
-    model: ObjectModel, gripper: Gripper, T_object_tcp: F64, opening_m: F64, rng: np.random.Generator
-) -> F32:
-    """Shares (n,) of the pulls that the hand holds at poses (n, 4, 4) with openings (n,)."""
-    held = held_trials(model.convex_parts_m, model.mass_kg, gripper, T_object_tcp, opening_m, rng, HandTest())
+    T, opening_m = poses.T_object_tcp[rows], poses.opening_m[rows]
+    held = held_trials(model.convex_parts_m, model.mass_kg, gripper, T, opening_m, rng, HandTest())
     return held.mean(axis=1).astype(np.float32)
 
 
-def _free_poses(model: ObjectModel, gripper: Gripper, rng: np.random.Generator) -> tuple[F64, F64, int]:
-    """Poses (N, 4, 4) and openings (N,) with the hand free of the object, and the number of poses tried."""
+def _free_poses(model: ObjectModel, gripper: Gripper, rng: np.random.Generator) -> tuple[F64, F64]:
+    """Poses (N, 4, 4) and openings (N,) with the hand free of the object."""
     solid = solid_of(model.convex_parts_m)
     hand = HandClearance(model.convex_parts_m, gripper)
     poses: list[F64] = [np.zeros((0, 4, 4))]
     openings: list[F64] = [np.zeros(0)]
-    n_tried = n_clear = 0
+    n_clear = 0
     for number in range(1, _MORE_ROUNDS + 1):
         points_m, normals = surface_points(solid, _POINTS, rng)
         pairs = contact_pairs(
@@ -115,7 +100,6 @@ def _free_poses(model: ObjectModel, gripper: Gripper, rng: np.random.Generator) 
         clear = _is_clear(model, gripper, T, np.minimum(width_m + AIR_M[0], gripper.max_opening_m))
         rows = np.concatenate([np.flatnonzero(clear)[:_CLEAR_POSES], np.flatnonzero(~clear)[:_OTHER_POSES]])
         T, width_m = T[rows], width_m[rows]
-        n_tried += len(T)
         for air_m in AIR_M:
             opening_m = np.minimum(width_m + air_m, gripper.max_opening_m)
             free = hand.free(T, opening_m)
@@ -126,7 +110,7 @@ def _free_poses(model: ObjectModel, gripper: Gripper, rng: np.random.Generator) 
         enough = n_clear >= _ENOUGH_CLEAR and sum(map(len, poses)) >= _ENOUGH_FREE
         if enough or (number >= _ROUNDS and n_clear >= _FEW_CLEAR):
             break
-    return np.concatenate(poses), np.concatenate(openings), n_tried
+    return np.concatenate(poses), np.concatenate(openings)
 
 
 def _is_clear(model: ObjectModel, gripper: Gripper, T_object_tcp: F64, opening_m: F64) -> Bools:
@@ -144,10 +128,6 @@ def _spread(T_object_tcp: F64, is_clear: Bools) -> npt.NDArray[np.int64]:
         [np.arange(len(clear)) / _CLEAR_IN_FOUR, np.arange(len(other)) / (4 - _CLEAR_IN_FOUR) + 0.5]
     )
     return np.concatenate([clear, other])[np.argsort(rank, kind="stable")]
-
-
-def _none(n_tried: int, reason: str) -> HandPoses:
-    return HandPoses(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0, bool), n_tried, reason)
 
 
 # How far the contacts lie ahead of the pads' middle, in half pad lengths. Pulled back, the finger tips do not

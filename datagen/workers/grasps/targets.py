@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,40 +22,14 @@ PER_FAMILY = 2
 _FAMILY = re.compile(r"^(\d+)-[a-z]_(.+)$")
 
 
-@dataclass(frozen=True)
-class Graspability:
-    """One object's line in the table of graspability; a target where `reason` is empty."""
-
-    name: str
-    n_tried: int  # poses of the hand checked against the object
-    n_free: int  # of these, the hand does not touch the object
-    n_clear: int  # of the free ones, the hand is above the upright object's support
-    n_scored: int  # free poses that were scored in physics
-    n_clear_held: int  # scored ones that are clear and have at least `min_score`
-    held_share: float  # n_clear_held over the scored ones that are clear
-    reason: str
-
-    @property
-    def is_target(self) -> bool:
-        return not self.reason
-
-
-def graspability(model: ObjectModel, gripper: Gripper, params: GraspParams) -> Graspability:
-    """Count the grasps of one object and decide whether it is a target. Never raises for any object."""
-    scored = scored_grasps(model, gripper, min(params.per_object, JUDGED_GRASPS))
-    good = scored.score >= params.min_score
-    n_clear_held = int((good & scored.is_clear).sum())
-    share = n_clear_held / max(int(scored.is_clear.sum()), 1)
-    reason = scored.reason
+def is_graspable(model: ObjectModel, gripper: Gripper, params: GraspParams) -> bool:
+    """Whether an object can be lifted from a table: light, with enough poses above it that hold."""
     if model.mass_kg > MAX_TARGET_MASS_KG:
-        reason = f"heavier than {MAX_TARGET_MASS_KG} kg"
-    elif not reason and scored.n_clear < MIN_CLEAR_GRASPS:
-        reason = "the table is in the way of the hand"
-    elif not reason and share < MIN_HELD_SHARE:
-        reason = "most grasps above the table slip"
-    return Graspability(
-        model.name, scored.n_tried, scored.n_free, scored.n_clear, len(scored), n_clear_held, share, reason
-    )
+        return False
+    scored = scored_grasps(model, gripper, min(params.per_object, JUDGED_GRASPS))
+    held = (scored.score >= params.min_score) & scored.is_clear
+    share = held.sum() / max(scored.is_clear.sum(), 1)
+    return bool(scored.n_clear >= MIN_CLEAR_GRASPS and share >= MIN_HELD_SHARE and scored.score.any())
 
 
 class Targets:
@@ -91,22 +63,12 @@ class Targets:
         names = [name for family in self._families.values() for name in family]
         return next((names[k] for k in rng.permutation(len(names)) if self.is_target(names[k])), None)
 
-    def names(self) -> list[str]:
-        """All targets, sorted; computes every object.
-
-        Processes that start together begin at different objects and read the others' results from the cache.
-        """
-        families = list(self._families.values())
-        begin = os.getpid() % max(len(families), 1)
-        found = [n for f in (*families[begin:], *families[:begin]) for n in f if self.is_target(n)]
-        return sorted(found)
-
     def _graspable(self, names: Sequence[str]) -> list[str]:
         sizes = sorted((self._load(name) for name in names), key=lambda model: (model.radius_m, model.name))
         inwards = [sizes[k // 2] if k % 2 == 0 else sizes[-1 - k // 2] for k in range(len(sizes))]
         found: list[str] = []
         for model in inwards:
-            if len(found) < PER_FAMILY and graspability(model, self._gripper, self._params).is_target:
+            if len(found) < PER_FAMILY and is_graspable(model, self._gripper, self._params):
                 found.append(model.name)
         return found
 

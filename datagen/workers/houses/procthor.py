@@ -1,4 +1,4 @@
-"""Folders of ProcTHOR houses: JSON lines (compressed or not) or single JSON files, and a size table."""
+"""Folders of ProcTHOR houses: JSON lines, compressed or not, and a size table."""
 
 from __future__ import annotations
 
@@ -10,50 +10,42 @@ from pathlib import Path
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
-from datagen.workers.furniture.assets import TABLE_NAMES, Asset, read_asset_table
+from datagen.workers.furniture.assets import Asset, read_asset_table
 from datagen.workers.furniture.solids import hash_bytes
 from datagen.workers.houses.house import House
-from datagen.workers.houses.line_index import MAX_LINES, LineIndex, houses_cache, open_lines
+from datagen.workers.houses.line_index import MAX_LINES, Line, LineIndex, open_lines
 from datagen.workers.houses.loader import build_house
 from datagen.workers.json_document import parse_json
 
 _MAX_FILES = 100_000
-_SUFFIXES = (".jsonl.gz", ".jsonl", ".json")
-# Tables that may be stored with the houses.
-_NOT_HOUSES = {
-    *TABLE_NAMES, "type_annotations.json", "placement-annotations.json", "receptacles.json",
-    "wall-holes.json", "asset_groups.json", "metadata.json",
-}  # fmt: skip
+_Place = tuple[LineIndex, Line]
 
 
 @dataclass(frozen=True, eq=False)
 class ProcthorHouses:
-    """The houses of one folder, found by id in memory-mapped files."""
+    """The houses of one folder, found by id."""
 
     digest: str
     folder: Path
     assets: dict[str, Asset]
-    files: list[LineIndex]
-    rows: dict[str, tuple[int, int]]  # id -> file and row
+    places: dict[str, _Place]  # by id
     clashes: dict[str, str] = field(default_factory=dict)  # id -> the lines that share it
     kind: str = "procthor"
 
     def house_ids(self) -> list[str]:
         """Ids, sorted."""
-        return list(self.rows)
+        return list(self.places)
 
     def load(self, house_id: str) -> House:
         """The house. Raises InputError that names the file, its line, the house and the JSON path."""
-        if house_id not in self.rows:
+        if house_id not in self.places:
             raise InputError(self.folder, "", f"has no house {house_id!r}", "Give one of its ids.")
         if house_id in self.clashes:
             fix = "Rename or remove one of them."
             raise InputError(self.folder, house_id, f"two houses: {self.clashes[house_id]}", fix)
-        file, row = self.rows[house_id]
-        index = self.files[file]
-        text = index.line(row)
-        place = f"{index.path}:{index.line_numbers[row]} ({house_id})"
-        return build_house(parse_json(text, place), house_id, index.digests[row].tobytes().hex(), self.assets)
+        index, line = self.places[house_id]
+        document = parse_json(index.text(line), f"{index.path}:{line.number} ({house_id})")
+        return build_house(document, house_id, line.sha256, self.assets)
 
 
 def open_procthor(folder: str) -> ProcthorHouses:
@@ -68,43 +60,40 @@ def open_procthor(folder: str) -> ProcthorHouses:
         raise InputError(folder or "procthor", "", "no such folder of houses", fix)
     assets, table = read_asset_table(path)
     with os.scandir(path) as entries:
-        found = (e.name for e in entries if e.name.endswith(_SUFFIXES) and e.name not in _NOT_HOUSES)
+        found = (e.name for e in entries if e.name.endswith((".jsonl.gz", ".jsonl")))
         names = sorted(itertools.islice(found, _MAX_FILES + 1))
     if not names:
-        raise InputError(path, "", "has no *.jsonl.gz, *.jsonl or *.json file with houses", fix)
+        raise InputError(path, "", "has no *.jsonl.gz or *.jsonl file with houses", fix)
     if len(names) > _MAX_FILES:
         raise InputError(path, "", f"has more than {_MAX_FILES} files", "Join them as JSON lines.")
-    cache = houses_cache()
     files, houses = list[LineIndex](), 0
     for name in names:
         if not name.isprintable():
             raise InputError(path, name, "has unprintable characters", "Rename the file.")
-        # Small .json files are read in memory; only files of many houses are worth unpacking.
-        files.append(open_lines(path / name, None if name.endswith(".json") else cache))
-        houses += len(files[-1].ids)
+        files.append(open_lines(path / name))
+        houses += len(files[-1].lines)
         if houses > MAX_LINES:
             raise InputError(path, name, f"has more than {MAX_LINES:,} houses", "Divide them among folders.")
-    rows, clashes = _rows(files)
-    if not rows:
+    places, clashes = _by_id(files)
+    if not places:
         raise InputError(path, "", "has files without houses", fix)
-    digests = [[i, files[f].digests[r].tobytes().hex()] for i, (f, r) in rows.items()]
+    digests = [[house_id, line.sha256] for house_id, (_, line) in places.items()]
     digest = digest_of([digests, hash_bytes(table.decode("utf-8", "replace")).hex()])
-    return ProcthorHouses(digest, path, assets, files, rows, clashes)
+    return ProcthorHouses(digest, path, assets, places, clashes)
 
 
-def _rows(files: list[LineIndex]) -> tuple[dict[str, tuple[int, int]], dict[str, str]]:
-    """File and row of each id, sorted by id, and clashing ids; identical copies of a house count once."""
-    found: dict[str, list[tuple[int, int]]] = defaultdict(list)
-    for f, index in enumerate(files):
+def _by_id(files: list[LineIndex]) -> tuple[dict[str, _Place], dict[str, str]]:
+    """The line of each id, sorted by id, and clashing ids; identical copies of a house count once."""
+    found: dict[str, list[_Place]] = defaultdict(list)
+    for index in files:
         stem = index.path.name.split(".")[0]
-        for row, own in enumerate(index.ids):
-            found[own or f"{stem}-{int(index.line_numbers[row]):06d}"].append((f, row))
-    rows: dict[str, tuple[int, int]] = {}
+        for line in index.lines:
+            found[line.house_id or f"{stem}-{line.number:06d}"].append((index, line))
+    places: dict[str, _Place] = {}
     clashes: dict[str, str] = {}
     for house_id in sorted(found):
         copies = found[house_id]
-        rows[house_id] = copies[0]
-        if len({files[f].digests[r].tobytes() for f, r in copies}) > 1:
-            named = [f"{files[f].path.name}:{files[f].line_numbers[r]}" for f, r in copies[:4]]
-            clashes[house_id] = " and ".join(named)
-    return rows, clashes
+        places[house_id] = copies[0]
+        if len({line.sha256 for _, line in copies}) > 1:
+            clashes[house_id] = " and ".join(f"{i.path.name}:{line.number}" for i, line in copies[:4])
+    return places, clashes

@@ -19,14 +19,12 @@ _IDENTITY = np.eye(4)
 class ForwardKinematics:
     """A serial arm as a product of exponentials (Brockett 1984): T(q) = E_1(q_1) ... E_A(q_A) T(0).
 
-    F frames: the robot's links, in order, and its TCP as the last one. A joint's E(q) is
-    I + a(q) P + b(q) S with constant P and S: a = sin q, b = 1 - cos q where it turns (Rodrigues), and
-    a = q, b = 0 where it slides.
+    F frames: the robot's links, in order, and its TCP as the last one. All joints turn: E(q) is
+    I + sin(q) P + (1 - cos(q)) S with constant P and S (Rodrigues).
     """
 
     first: F64  # (A, 4, 4), P
     second: F64  # (A, 4, 4), S
-    turns: tuple[bool, ...]  # (A,)
     T_base_frame: F64  # (F, 4, 4), all joints at zero
     depth: Ints  # (F,), number of joints that move the frame
 
@@ -50,12 +48,12 @@ class ForwardKinematics:
         return np.matmul(T, self.T_base_frame[-1])
 
     def _step(self, joint: int, q: F64) -> F64:
-        a, b = (np.sin(q), 1 - np.cos(q)) if self.turns[joint] else (q, np.zeros_like(q))
+        a, b = np.sin(q), 1 - np.cos(q)
         return _IDENTITY + a[:, None, None] * self.first[joint] + b[:, None, None] * self.second[joint]
 
 
 def forward_kinematics(robot: Robot) -> ForwardKinematics:
-    """The robot's kinematics, computed from its poses at zero and with each joint moved by 1 (rad or m).
+    """The robot's kinematics, computed from its poses at zero and with each joint turned by 1 rad.
 
     Raises ValueError where its links are not one chain of the arm's joints.
     """
@@ -65,7 +63,7 @@ def forward_kinematics(robot: Robot) -> ForwardKinematics:
         return np.concatenate([robot.T_base_link(q), robot.T_base_tcp(q)[None]])
 
     zero = frames(np.zeros(count))
-    first, second, turns = np.zeros((count, 4, 4)), np.zeros((count, 4, 4)), []
+    first, second = np.zeros((count, 4, 4)), np.zeros((count, 4, 4))
     moved = np.zeros((count, len(zero)), np.bool_)
     for joint in range(count):
         one = frames(np.eye(count)[joint])
@@ -73,15 +71,11 @@ def forward_kinematics(robot: Robot) -> ForwardKinematics:
         moved[joint, -1] = True
         E = one[-1] @ inverse(zero[-1])
         K = (E[:3, :3] - E[:3, :3].T) / (2 * np.sin(1.0))
-        turns.append(bool(np.abs(K).max() > _MOVES))
-        if turns[-1]:
-            # A point r on the axis: t = (I - R) r; the pseudo-inverse leaves out the axis itself.
-            r = np.linalg.pinv(np.eye(3) - E[:3, :3], rcond=1e-6) @ E[:3, 3]
-            first[joint, :3] = np.column_stack([K, -K @ r])
-            second[joint, :3] = np.column_stack([K @ K, -K @ K @ r])
-        else:
-            first[joint, :3, 3] = E[:3, 3]
+        # A point r on the axis: t = (I - R) r; the pseudo-inverse leaves out the axis itself.
+        r = np.linalg.pinv(np.eye(3) - E[:3, :3], rcond=1e-6) @ E[:3, 3]
+        first[joint, :3] = np.column_stack([K, -K @ r])
+        second[joint, :3] = np.column_stack([K @ K, -K @ K @ r])
     depth = moved.sum(axis=0)
     if not (moved == (np.arange(count)[:, None] < depth)).all():
         raise ValueError(f"the links of {robot.name} are not one chain of its arm's joints")
-    return ForwardKinematics(first, second, tuple(turns), zero, depth.astype(np.int64))
+    return ForwardKinematics(first, second, zero, depth.astype(np.int64))

@@ -108,7 +108,6 @@ def reach_table(robot: Robot, kinematics: ForwardKinematics, draw: int = 0) -> R
     samples = _samples(
         shared(kinematics.first),
         shared(kinematics.second),
-        kinematics.turns,
         shared(T_wrist),
         lower.tobytes(),
         upper.tobytes(),
@@ -121,7 +120,6 @@ def reach_table(robot: Robot, kinematics: ForwardKinematics, draw: int = 0) -> R
 def _samples(
     first: bytes,
     second: bytes,
-    turns: tuple[bool, ...],
     T_wrist: bytes,
     lower_rad: bytes,
     upper_rad: bytes,
@@ -129,12 +127,12 @@ def _samples(
 ) -> _Samples:
     """Samples of an arm by its rounded numbers alone: the scale that is opened first does not matter."""
     P, S, T = (np.frombuffer(m).reshape(-1, 4, 4) for m in (first, second, T_wrist))
-    kinematics = ForwardKinematics(P, S, turns, T, np.array([len(turns)]))
+    kinematics = ForwardKinematics(P, S, T, np.array([len(P)]))
     rng = np.random.Generator(np.random.PCG64(draw))
     lower, upper = np.frombuffer(lower_rad), np.frombuffer(upper_rad)
     q = rng.uniform(lower, upper, (_SAMPLES + _PROBES, len(lower)))
     axis = P[0, :3, :3]  # the cross product with the first joint's axis
-    is_upright = bool(turns[0] and abs(axis[1, 0] - 1) < 1e-6 and np.abs(P[0, :2, 3]).max() < 1e-6)
+    is_upright = bool(abs(axis[1, 0] - 1) < 1e-6 and np.abs(P[0, :2, 3]).max() < 1e-6)
     poses = kinematics.tcp(q)
     features, azimuth = _features(poses[:, :3, 3], poses[:, :3, :3], is_upright)
     tree = KDTree(features[:_SAMPLES])

@@ -34,17 +34,7 @@ _NEIGHBOURS = 12
 _CELLS_ACROSS = 32  # of the distance grid, along the object's longest side
 # Hulls whose errors differ by less are compared by the volume they add.
 _ERROR_STEP_M = 2e-4
-_CACHE = CacheFolder(
-    "hulls",
-    {
-        "vertices": (np.float32, ("corners", 3)),
-        "cuts": (np.int64, ("cuts",)),
-    },
-    most_files=4096,  # of some 20 KB each
-    most_bytes=32 * 2**20,
-)
-
-
+_CACHE = CacheFolder("hulls", most_files=4096)  # of some 20 KB each
 _known: dict[str, tuple[F32, ...]] = {}
 
 

@@ -22,23 +22,8 @@ from datagen.workers.objects.texture import face_colours, read_texture
 READER_VERSION = 1
 MIN_SIZE_M = 0.002
 MAX_SIZE_M = 2.0
-_CACHE = CacheFolder(
-    "objects",
-    {
-        "vertices": (np.float32, ("vertices", 3)),
-        "faces": (np.int32, ("faces", 3)),
-        "face_rgb": (np.uint8, ("faces", 3)),
-        "image": (np.uint8, ("rows", "columns", 3)),
-        "uv": (np.float32, ("vertices", 2)),
-        "part_vertices": (np.float32, ("corners", 3)),
-        "part_cuts": (np.int64, ("cuts",)),
-        "volume": (np.float64, ()),
-        "size_m": (np.float64, (3,)),
-    },
-    most_files=1024,
-    most_bytes=512 * 2**20,
-)
-_VOLUMES = CacheFolder("volumes", {"volumes_m3": (np.float64, ("scans",))}, most_files=64, most_bytes=2**20)
+_CACHE = CacheFolder("objects", most_files=1024)
+_VOLUMES = CacheFolder("volumes", most_files=64)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,6 @@ class LinkBody:
     name: str
     inertial: Inertial | None
     parts_m: Parts  # link frame
-    unscaled_m: Parts  # the same, unscaled
     visuals: tuple[Shape, ...]  # visual meshes, link frame, unscaled
     scale: float
     drawn_m: Parts  # parts to draw where there are no visuals
@@ -86,7 +85,6 @@ def assemble(description: RobotDescription, reach_m: float | None, lift_m: float
         links[-1] = replace(
             last,
             parts_m=(*last.parts_m, tube),
-            unscaled_m=(*last.unscaled_m, (tube / scale).astype(np.float32)),
             drawn_m=(*last.drawn_m, tube),
         )
     fingers = _fingers(hand, description.hand)
@@ -198,13 +196,10 @@ def _body(
     path: Path, name: str, cluster: _Cluster, scale: float, cuts_m: Mapping[str, tuple[float, ...]]
 ) -> LinkBody:
     parts: list[F32] = []
-    unscaled: list[F32] = []
     visuals: list[Shape] = []
     for link, T in cluster.values():
         for shape in link.collisions:
-            cuts = cuts_m.get(link.name, ())
-            parts += shape_parts(_placed(shape, T), scale, cuts)
-            unscaled += shape_parts(_placed(shape, T), 1.0, cuts)
+            parts += shape_parts(_placed(shape, T), scale, cuts_m.get(link.name, ()))
         visuals += (_placed(shape, T) for shape in link.visuals)
     if not parts:
         raise _wrong(path, f"link {name}", "has no collision shape")
@@ -215,7 +210,7 @@ def _body(
     if any(shape.mesh is None or shape.mesh.suffix != ".glb" for shape in visuals):
         visuals = []
     drawn = () if visuals else tuple(parts)
-    return LinkBody(name, inertial, tuple(parts), tuple(unscaled), tuple(visuals), scale, drawn)
+    return LinkBody(name, inertial, tuple(parts), tuple(visuals), scale, drawn)
 
 
 def _placed(shape: Shape, T: F64) -> Shape:

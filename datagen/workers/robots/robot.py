@@ -5,13 +5,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pinocchio
 from scipy.linalg import lapack
+from scipy.spatial import ConvexHull
 
 from datagen.schemas.identity import digest_of
 from datagen.workers.geometry.mesh import F32, F64, Mesh, concatenate
@@ -20,7 +20,6 @@ from datagen.workers.houses.glb import read_glb
 from datagen.workers.robots.assembly import Assembly, LinkBody, assemble
 from datagen.workers.robots.description import Gripper, HandDescription, Parts, RobotDescription
 from datagen.workers.robots.hulls import hull_faces, polyhedron
-from datagen.workers.robots.robot_files import RobotFiles, hull_of
 
 # Their binary modules have no types.
 pin: Any = pinocchio
@@ -52,7 +51,6 @@ class Robot:
         lift = description.lift
         lift_m = base_height_m - lift.mount_at_zero_m if lift else 0.0
         assembly = assemble(description, reach_m, lift_m)
-        count = len(assembly.arm)
         self.name = description.name  # as the registry and the specification name it
         # Largest distance from the first joint that moves the TCP to the TCP.
         self.reach_m: float = assembly.reach_m if reach_m is None else reach_m
@@ -78,7 +76,7 @@ class Robot:
         self.link_names = tuple(body.name for body in assembly.bodies)  # (L,)
         # (L,) convex parts in link frames, fingers fully open.
         self.link_parts_m: tuple[Parts, ...] = tuple(body.parts_m for body in assembly.bodies)
-        self._assembly = assembly
+        self.assembly = assembly
         self._model = _model_of(assembly, self.T_base_root)
         self._data = self._model.createData()
         self._tcp = self._model.getFrameId("tcp")
@@ -88,25 +86,9 @@ class Robot:
         joints = [frames[f].parentJoint for f in self._frames]
         placements = [frames[f].placement.homogeneous for f in self._frames]
         # One hull a finger is close enough and four times as fast as its boxes.
-        parts = [*self.link_parts_m[:-2], *((hull_of(p),) for p in self.link_parts_m[-2:])]
+        parts = [*self.link_parts_m[:-2], *((_joint_hull(p),) for p in self.link_parts_m[-2:])]
         self._self_collision = SelfCollision(self._model, parts, joints, placements)
         self.self_pairs = self._self_collision.pairs  # pairs of links that must not touch
-        names = self.link_names
-        disabled = [
-            (names[a], names[b])
-            for a in range(len(names))
-            for b in range(a + 1, len(names))
-            if (a, b) not in self.self_pairs and not (b <= count and b == a + 1)
-        ]
-        self._files = RobotFiles(self.name, assembly, disabled)
-
-    @property
-    def urdf(self) -> Path:
-        """Path of its URDF for physics engines, with paths of meshes that resolve.
-
-        The files are written on first use and stay for at least an hour. Get `urdf` again to read them later.
-        """
-        return self._files.urdf()
 
     def at_height(self, base_height_m: float) -> Robot:
         """The same arm on a pedestal of another height; both share all other data."""
@@ -146,7 +128,7 @@ class Robot:
 
     def link_meshes(self) -> tuple[Mesh, ...]:
         """Visual meshes (L,), link frames."""
-        return tuple(_mesh_of(body) for body in self._assembly.bodies)
+        return tuple(_mesh_of(body) for body in self.assembly.bodies)
 
 
 def _model_of(assembly: Assembly, T_base_root: F64) -> Any:
@@ -197,6 +179,12 @@ def _gripper(hand: HandDescription, assembly: Assembly) -> Gripper:
 
 def _moved(part: F32, T: F64) -> F32:
     return (part.astype(np.float64) @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+
+
+def _joint_hull(parts_m: Parts) -> F32:
+    """Corners (V, 3) of the one hull around several parts."""
+    points = np.concatenate(parts_m)
+    return points[np.sort(ConvexHull(points).vertices)]
 
 
 def _mesh_of(body: LinkBody) -> Mesh:

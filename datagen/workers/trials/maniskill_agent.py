@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -20,6 +22,7 @@ from mani_skill.agents.controllers.pd_joint_pos import (
 from mani_skill.agents.registration import register_agent
 
 from datagen.workers.robots.robot import Robot
+from datagen.workers.robots.robot_files import write_urdf
 from datagen.workers.trials.drive_targets import FINGER_DAMPING, FINGER_STIFFNESS
 
 
@@ -56,8 +59,9 @@ def agent_of(robot: Robot, grip_force_n: float) -> type[BaseAgent]:
     first, second = robot.finger_joint_names
 
     class DatagenArm(BaseAgent):
-        uid = f"datagen-{robot.urdf.stem}-{grip_force_n:g}"
-        urdf_path = str(robot.urdf)
+        uid = f"datagen-{robot.name}-{robot.reach_m!r}-{robot.base_height_m!r}-{grip_force_n:g}"
+        files = TemporaryDirectory(prefix="datagen-robot-")  # removed when the process ends
+        urdf_path = str(write_urdf(robot, Path(files.name)))
         disable_self_collisions = True
 
         @property

@@ -24,7 +24,6 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.motion import MotionPlan
 from datagen.workers.robots.robot import Robot
-from datagen.workers.robots.urdf import read_urdf
 from datagen.workers.settling.sapien_physics import sapien_pose
 from datagen.workers.trials import Disturbance
 from datagen.workers.trials.drive_targets import (
@@ -108,7 +107,8 @@ class DatagenGraspEnv(BaseEnv):
         self.robot: Robot = self.tasks[0].prepared.robot
         self.params: TrialParams = self.tasks[0].prepared.params
         if any(
-            t.prepared.robot.urdf != self.robot.urdf or t.prepared.params != self.params for t in self.tasks
+            t.prepared.robot.assembly is not self.robot.assembly or t.prepared.params != self.params
+            for t in self.tasks
         ):
             fix = "Make one environment for each robot and set of parameters"
             raise InputError(ENV_ID, "tasks", "differ in robot or parameters", fix)
@@ -144,27 +144,21 @@ class DatagenGraspEnv(BaseEnv):
         """No lights: nothing here is rendered."""
 
     def _load_agent(self, options: dict[str, Any], *args: Any, **kwargs: Any) -> None:
-        tree = read_urdf(self.robot.urdf)  # first: `urdf` writes the files that the agent loads
         super()._load_agent(options, self._root_poses(), build_separate=True)
-        above = {joint.child: joint for joint in tree.joints.values()}
-        shoulder, fingers = self.robot.joint_names[0], self.robot.finger_joint_names
+        base, shoulder, *_, palm = self.robot.link_names[:-2]
+        fingers = self.robot.link_names[-2:]
         for link in self.agent.robot.get_links():
-            joint = above.get(link.name)
-            while joint is not None and joint.name not in (*self.robot.joint_names, *fingers):
-                joint = above.get(joint.parent)  # fixed to the link above
-            name = "" if joint is None else joint.name
-            groups = CARRIER if name == "" else SHOULDER if name == shoulder else ARM
+            groups = CARRIER if link.name == base else SHOULDER if link.name == shoulder else ARM
             for env, body in enumerate(link._objs):  # pyright: ignore[reportPrivateUsage]
                 friction = self.tasks[env].disturbance.object_friction
                 for shape in body.get_collision_shapes():
                     tune_shape(shape, groups)
                     shape.set_physical_material(physx.PhysxMaterial(friction, friction, 0.0))
-                    if name in fingers:
+                    if link.name in fingers:
                         pad_m = sum(self.robot.gripper.pad_size_m) / 2
                         tune_pad(shape, friction, self.params.finger_friction, pad_m)
         links = self.agent.robot.links_map
-        self.fingers: list[Link] = [links[tree.joint(name).child] for name in fingers]
-        palm = tree.joint(fingers[0]).parent
+        self.fingers: list[Link] = [links[name] for name in fingers]
         self.palm: Link = links[palm]
         q = self.robot.homes_rad[0]
         T_base_palm = self.robot.T_base_link(q)[self.robot.link_names.index(palm)]

@@ -126,7 +126,7 @@ class TrialWorld:
         columns = {joint.name: k for k, joint in enumerate(joints)}
         self._columns = np.array([columns[n] for n in (*robot.joint_names, *robot.finger_joint_names)])
         self._joints = [joints[k] for k in self._columns]
-        self._fingers = [links[k] for k in articulation.order[-2:]]
+        self._fingers = links[-2:]
 
     def _add(self, body: sapien.Component, T_world_body: F64 | None = None) -> None:
         entity = sapien.Entity()
@@ -269,13 +269,13 @@ def _robot_links(
 ) -> list[physx.PhysxArticulationLinkComponent]:
     links: list[physx.PhysxArticulationLinkComponent] = []
     material = physx.PhysxMaterial(friction, friction, 0.0)
-    fingers, shoulder = articulation.order[-2:], articulation.order[0]
     for k, body in enumerate(articulation.bodies):
+        is_finger = body.kind == "prismatic"
         link = physx.PhysxArticulationLinkComponent(links[body.parent] if body.parent >= 0 else None)
         for part in body.parts_m:
             shape = convex_shape(part, material)
-            tune_shape(shape, CARRIER if k == 0 else SHOULDER if k == shoulder else ARM)
-            if k in fingers:
+            tune_shape(shape, CARRIER if k == 0 else SHOULDER if k == 1 else ARM)
+            if is_finger:
                 tune_pad(shape, friction, params.finger_friction, sum(robot.gripper.pad_size_m) / 2)
             link.attach(shape)
         link.set_mass(body.mass_kg)
@@ -291,7 +291,7 @@ def _robot_links(
             joint.set_pose_in_parent(sapien_pose(body.T_parent_joint))
             joint.set_pose_in_child(sapien_pose(body.T_body_joint))
             joint.set_limits([[body.lower, body.upper]])
-            if k in fingers:
+            if is_finger:
                 joint.set_drive_properties(FINGER_STIFFNESS, FINGER_DAMPING, params.grip_force_n, "force")
             else:
                 joint.set_drive_properties(robot.stiffness, robot.damping, robot.force_limit_n, "force")

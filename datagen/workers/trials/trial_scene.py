@@ -11,8 +11,9 @@ from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import translation
 from datagen.workers.objects.part_merging import merge_parts
+from datagen.workers.robots.assembly import LinkBody
 from datagen.workers.robots.robot import Robot
-from datagen.workers.robots.urdf import Joint, UrdfTree, read_urdf
+from datagen.workers.robots.urdf import Joint, rotation_rpy, rpy_rotation
 from datagen.workers.scenes import SettledScene
 from datagen.workers.trials import Disturbance
 
@@ -42,68 +43,53 @@ class MovingBody:
 
 @dataclass(frozen=True, eq=False)
 class Articulation:
-    """The bodies of a robot, parents first; arm joints come before those of the fingers in `order`."""
+    """The bodies of a robot: body 0, those that the arm's joints move, then the two fingers."""
 
     bodies: tuple[MovingBody, ...]
-    order: tuple[int, ...]  # bodies moved by the arm's joints, then by the two fingers'
     T_base_root: F64  # (4, 4), body 0 in the base frame
 
 
 def articulation_of(robot: Robot) -> Articulation:
-    """Read the URDF, in which only the joints of the arm and the fingers move.
-
-    Raises InputError where it is broken or lacks a joint.
-    """
-    tree = read_urdf(robot.urdf)
-    moving = (*robot.joint_names, *robot.finger_joint_names)
-    for name in moving:
-        tree.joint(name)
-    root = next(name for name in tree.links if tree.joint_above(name) is None)
-    bodies: list[MovingBody] = []
-    waiting: list[tuple[int, Joint | None, F64, str]] = [(-1, None, np.eye(4), root)]
-    while waiting:
-        parent, joint, T_parent_child, link = waiting.pop(0)
-        rigid = _rigid_links(tree, link, moving)
-        index = len(bodies)
-        bodies.append(_body(tree, rigid, parent, joint, T_parent_child, robot))
-        for name, T_body_link in rigid:
-            for below in tree.children(name):
-                if below.name in moving:
-                    waiting.append((index, below, T_body_link @ below.T_parent_child, below.child))
-    by_joint = {body.joint: k for k, body in enumerate(bodies)}
-    return Articulation(tuple(bodies), tuple(by_joint[name] for name in moving), robot.T_base_root)
+    """The bodies that the joints of the arm and of the fingers move."""
+    assembly, count = robot.assembly, len(robot.assembly.arm)
+    arm, palm, fingers = (
+        assembly.bodies[: count + 1],
+        assembly.bodies[count + 1],
+        assembly.bodies[count + 2 :],
+    )
+    T_palm = _rounded(assembly.palm.T_parent_child)
+    bodies = [_body([(arm[0], np.eye(4))], -1, None, np.eye(4))]
+    for k, joint in enumerate(assembly.arm):
+        carried = [(palm, T_palm)] if k == count - 1 else []
+        T = _rounded(joint.T_parent_child)
+        bodies.append(_body([(arm[k + 1], np.eye(4)), *carried], k, joint, T))
+    for body, joint in zip(fingers, assembly.fingers, strict=True):
+        bodies.append(_body([(body, np.eye(4))], count, joint, T_palm @ _rounded(joint.T_parent_child)))
+    return Articulation(tuple(bodies), robot.T_base_root)
 
 
-def _rigid_links(tree: UrdfTree, link: str, moving: tuple[str, ...]) -> list[tuple[str, F64]]:
-    """The link and all links fixed to it by joints that do not move, with their poses in its frame."""
-    found = [(link, np.eye(4))]
-    for name, T in found:
-        for joint in tree.children(name):
-            if joint.name not in moving:
-                found.append((joint.child, T @ joint.T_parent_child))
-    return found
+def _rounded(T: F64) -> F64:
+    """A pose (4, 4) with its rotation as its URDF would give it: physics depends on the last bits."""
+    out = T.copy()
+    out[:3, :3] = rpy_rotation(rotation_rpy(T[:3, :3]))
+    return out
 
 
 def _body(
-    tree: UrdfTree,
-    rigid: list[tuple[str, F64]],
-    parent: int,
-    joint: Joint | None,
-    T_parent_child: F64,
-    robot: Robot,
+    rigid: list[tuple[LinkBody, F64]], parent: int, joint: Joint | None, T_parent_child: F64
 ) -> MovingBody:
-    shapes = dict(zip(robot.link_names, robot.link_parts_m, strict=True))
+    """The body of links that are fixed to one another, with their poses in the frame of the first."""
     parts: list[F32] = []
     mass, moment, about_origin = 0.0, np.zeros(3), np.zeros((3, 3))
-    for name, T in rigid:
-        link = tree.link(name)
-        for part in shapes.get(name, ()):
+    for link, T in rigid:
+        for part in link.parts_m:
             parts.append((part @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
         if link.inertial is not None:
             centre = T[:3, :3] @ link.inertial.centre_m + T[:3, 3]
             mass += link.inertial.mass_kg
             moment += link.inertial.mass_kg * centre
-            about_origin += T[:3, :3] @ link.inertial.inertia_kgm2 @ T[:3, :3].T
+            upper = np.triu(link.inertial.inertia_kgm2)
+            about_origin += T[:3, :3] @ (upper + np.triu(upper, 1).T) @ T[:3, :3].T
             about_origin += link.inertial.mass_kg * _parallel(centre)
     centre = moment / mass if mass > 0 else np.zeros(3)
     values, axes = np.linalg.eigh(about_origin - mass * _parallel(centre))
@@ -112,17 +98,13 @@ def _body(
     T_body_principal = translation(*centre)
     T_body_principal[:3, :3] = axes
     T_body_joint = np.eye(4)
-    kind: Literal["revolute", "prismatic"] = "revolute"
-    name, lower, upper = "", 0.0, 0.0
+    name, lower, upper_limit = "", 0.0, 0.0
     if joint is not None:
-        T_body_joint[:3, :3] = _x_onto(joint.axis)
-        kind = "prismatic" if joint.kind == "prismatic" else "revolute"
-        name, lower, upper = joint.name, joint.lower, joint.upper
-        if name in robot.joint_names:
-            k = robot.joint_names.index(name)
-            lower, upper = float(robot.q_lower_rad[k]), float(robot.q_upper_rad[k])
+        T_body_joint[:3, :3] = _x_onto(joint.axis / np.linalg.norm(joint.axis))
+        name, lower, upper_limit = joint.name, joint.lower, joint.upper
+    kind = "prismatic" if joint is not None and joint.kind == "prismatic" else "revolute"
     return MovingBody(
-        parent, name, kind, T_parent_child @ T_body_joint, T_body_joint, lower, upper, tuple(parts),
+        parent, name, kind, T_parent_child @ T_body_joint, T_body_joint, lower, upper_limit, tuple(parts),
         max(mass, _LEAST_MASS_KG), T_body_principal, np.maximum(values, _LEAST_INERTIA_KGM2),
     )  # fmt: skip
 
@@ -177,8 +159,7 @@ def prepare_trials(
 ) -> TrialScene:
     """Geometry of a scene and a robot, ready for any number of trials.
 
-    `base_radius_m` is that of the pedestal, for robots without a base of their own. Raises InputError
-    where the robot's URDF cannot be used.
+    `base_radius_m` is that of the pedestal, for robots without a base of their own.
     """
     still = tuple(part for body in scene.house.house.bodies for part in body.convex_parts_m)
     low = np.array([part.min(axis=0) for part in still], np.float64).reshape(-1, 3)

@@ -17,7 +17,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datagen.schemas.specification import GraspParams
-from datagen.workers.geometry.mesh import F64
 from datagen.workers.grasps import grasp_cache
 from datagen.workers.grasps.grasp_cache import (
     SCORED_FIRST,
@@ -105,19 +104,6 @@ def test_later_grasps_are_scored_when_asked_for(monkeypatch: pytest.MonkeyPatch)
     assert [grasps.holds(row) for row in (0, known + BLOCK)] == [True, asked[0] >= 0.5]
 
 
-def test_any_pose_can_be_scored() -> None:
-    """A pure function of the object, the hand and the pose."""
-    model = ORDER[0]
-    grasps = grasps_of(model, GRIPPER, GraspParams(per_object=BLOCK))
-    T, opening_m = grasps.T_object_tcp.copy(), grasps.opening_m.astype(np.float64)
-    near = grasps.with_poses(T, opening_m)
-    scores = [near.score_of(row) for row in range(8)]
-    assert np.mean(scores) > 0.5 and all(near.holds(row) == (scores[row] >= 0.5) for row in range(8))
-    assert scores == [near.with_poses(T[row:], opening_m[row:]).score_of(0) for row in range(8)]
-    T[:, :3, 3] += 1.0
-    assert grasps.with_poses(T, opening_m).score_of(0) == 0.0
-
-
 def test_another_draw_gives_other_grasps() -> None:
     model, params = ORDER[0], GraspParams(per_object=BLOCK, min_score=0.0)
     first, other = (grasps_of(model, GRIPPER, params, draw) for draw in (0, 1))
@@ -146,7 +132,7 @@ def test_flat_things_on_a_table_have_grasps_above_it(size_m: tuple[float, float,
     assert scored.score[scored.is_clear].max() == 1.0
 
 
-def test_what_cannot_be_grasped_gives_none_and_a_reason() -> None:
+def test_objects_that_cannot_be_grasped_have_no_grasps() -> None:
     cube = box_model("cube", (0.12, 0.12, 0.12))
     # Two boards with a rod between them: narrow enough, but the hand cannot come in.
     boards = [box_vertices((0.3, 0.3, 0.1), (0, 0, z)) for z in (-0.07, 0.07)]
@@ -154,18 +140,10 @@ def test_what_cannot_be_grasped_gives_none_and_a_reason() -> None:
     flat = replace(cube, name="sheet", convex_parts_m=(box_vertices((0.1, 0.1, 0.0)),))
     bare = replace(cube, name="bare", convex_parts_m=())
     nan = replace(cube, name="nan", convex_parts_m=(cube.convex_parts_m[0] * np.float32("nan"),))
-    heavy = box_model("lead", (0.05, 0.05, 0.1), mass_kg=50.0)
-    for model, reason in (
-        (cube, "near enough"),
-        (spool, "touches"),
-        (flat, "volume"),
-        (bare, "no collision parts"),
-        (nan, "not finite"),
-    ):
-        scored = scored_grasps(model, GRIPPER, FEW.per_object)
-        assert reason in scored.reason
+    for model in (cube, spool, flat, bare, nan):
         assert len(grasps_of(model, GRIPPER, FEW)) == 0
     # A palm below may carry what no fingers hold, in one of the pulls.
+    heavy = box_model("lead", (0.05, 0.05, 0.1), mass_kg=50.0)
     assert scored_grasps(heavy, GRIPPER, FEW.per_object).score.max() < 0.5
 
 
@@ -227,29 +205,12 @@ def test_what_is_kept_is_what_was_found(own_cache: Path, monkeypatch: pytest.Mon
         assert [file.suffix for file in (own_cache / folder).iterdir()] == [".npz"]
 
 
-@pytest.mark.parametrize("folder", ["hand-poses", "grasps"])
-def test_broken_and_foreign_files_are_worked_out_again(own_cache: Path, folder: str) -> None:
+def test_damaged_files_are_computed_again(own_cache: Path) -> None:
     box = box_model("box", (0.05, 0.04, 0.1))
     first = grasps_of(box, GRIPPER, SIX)
-    (file,) = (own_cache / folder).iterdir()
-    good = file.read_bytes()
-    with np.load(file) as data:
-        content = dict(data)
-
-    def with_changed(**changed: object) -> bytes:
-        with file.open("wb") as out:
-            np.savez(out, **{**content, **changed})  # pyright: ignore[reportArgumentType]
-        return file.read_bytes()
-
-    bads = [b"", b"not a zip", good[: len(good) // 2], good[:-40], with_changed(key=np.array("0" * 64))]
-    if folder == "grasps":
-        bads += [with_changed(score=content["score"] + 2), with_changed(score=content["score"][:-1])]
-    else:
-        T: F64 = content["T_object_tcp"]
-        bads += [with_changed(T_object_tcp=bad) for bad in (T[:, :3], 2 * T, T.astype(np.float32))]
-        bads += [with_changed(opening_m=content["opening_m"][:-1]), with_changed(n_tried=np.array("x"))]
-    for bad in bads:
-        file.write_bytes(bad)
+    for file in own_cache.rglob("*.npz"):
+        good = file.read_bytes()
+        file.write_bytes(good[: len(good) // 2])
         grasp_cache._kept.clear()
         assert same(first, grasps_of(box, GRIPPER, SIX))
         assert len(file.read_bytes()) == len(good)

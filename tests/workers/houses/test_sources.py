@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
 from datagen.workers.houses import HOUSE_SOURCES, ids_of_split, open_houses, split_of
-from datagen.workers.houses.line_index import houses_cache, open_lines
 from tests.workers.houses.house_files import SIZES, two_rooms, write_houses
 
 
@@ -48,15 +47,9 @@ def test_the_digest_is_of_content_not_of_names_or_compression(tmp_path: Path):
     assert open_houses(f"procthor:{write_houses(tmp_path / 'five', houses, sizes)}").digest != first.digest
 
 
-def test_single_files_lists_and_official_names(tmp_path: Path):
-    write_houses(tmp_path, [{k: v for k, v in two_rooms().items() if k != "_id"}] * 1, name="train.jsonl.gz")
-    (tmp_path / "one.json").write_text(json.dumps(named("single"), indent=1))
-    (tmp_path / "many.json").write_text(json.dumps([named("m0"), named("m1")]))
-    (tmp_path / "type_annotations.json").write_text("{}")
-    source = open_houses(f"procthor:{tmp_path}")
-    assert source.house_ids() == ["m0", "m1", "single", "train-000001"]
-    for house_id in source.house_ids():
-        assert len(source.load(house_id).rooms) == 2
+def test_lines_without_an_id_are_named_by_file_and_line(tmp_path: Path):
+    write_houses(tmp_path, [{k: v for k, v in two_rooms().items() if k != "_id"}], name="train.jsonl.gz")
+    assert open_houses(f"procthor:{tmp_path}").house_ids() == ["train-000001"]
 
 
 def test_ids_come_from_the_top_level_alone(tmp_path: Path):
@@ -78,21 +71,18 @@ def test_the_original_asset_database_serves_as_well(tmp_path: Path):
         assert [s.height_m for s in house.surfaces] == [pytest.approx(0.75)]
 
 
-def test_the_cache_is_used_repaired_and_never_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_damaged_packed_houses_are_read_from_the_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "cache"))
     ref = f"procthor:{write_houses(tmp_path / 'houses', [named('a'), named('b')])}"
     before = open_houses(ref)
-    before.load("a")
-    cached = sorted((tmp_path / "cache").rglob("*.*"))
-    assert [p.suffix for p in cached] == [".jsonl", ".npz"]
-    data, index = cached
-    index.write_bytes(b"PK\x03\x04 nonsense")
+    (packed,) = (tmp_path / "cache").rglob("*.*")
+    good = packed.read_bytes()
+    packed.write_bytes(good[:-9])
     assert open_houses(ref).load("b").digest == before.load("b").digest
-    data.write_bytes(data.read_bytes()[:-9])
-    assert open_houses(ref).digest == before.digest
-    bad = bytearray(data.read_bytes())
-    bad[40] ^= 1
-    data.write_bytes(bytes(bad))
+    assert packed.read_bytes() == good
+    bad = bytearray(good)
+    bad[60] ^= 1
+    packed.write_bytes(bytes(bad))
     damaged = open_houses(ref)
     # The folder still holds the house: a scene must not be drawn elsewhere for a damaged copy.
     assert damaged.load("a").digest == before.load("a").digest
@@ -102,21 +92,12 @@ def test_the_cache_is_used_repaired_and_never_trusted(tmp_path: Path, monkeypatc
 
 
 def test_without_a_cache_everything_works_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    blocked = tmp_path / "file"
-    blocked.write_text("")
+    (tmp_path / "file").write_text("")
     ref = f"procthor:{write_houses(tmp_path / 'houses', [named('a'), named('b')])}"
     digest = open_houses(ref).digest
-    monkeypatch.setenv("DATAGEN_CACHE", str(blocked / "below-a-file"))
-    assert houses_cache() is None
+    monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "file"))
     source = open_houses(ref)
     assert source.digest == digest and source.load("a").rooms
-
-
-def test_a_cache_that_cannot_take_the_houses_is_done_without(tmp_path: Path):
-    path = write_houses(tmp_path, [named("a")]) / "houses.jsonl.gz"
-    (tmp_path / "full").write_text("")
-    index = open_lines(path, tmp_path / "full")
-    assert index.ids == ["a"] and isinstance(index.data, bytearray)
 
 
 def test_many_open_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -126,7 +107,7 @@ def test_many_open_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         sources = list(pool.map(lambda _: open_houses(ref), range(16)))
     assert len({s.digest for s in sources}) == 1
     assert all(s.load("h7").rooms for s in sources)
-    assert len(list((tmp_path / "cache").rglob("*.*"))) == 2  # no leftovers
+    assert len(list((tmp_path / "cache").rglob("*.*"))) == 1  # no leftovers
 
 
 @given(st.text(max_size=30))

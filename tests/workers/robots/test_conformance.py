@@ -44,7 +44,6 @@ def test_lengths_and_limits(robot: Robot) -> None:
     assert (robot.q_lower_rad < robot.q_upper_rad).all() and (robot.speed_limit_radps > 0).all()
     assert len(robot.link_parts_m) == links == len(robot.link_meshes())
     assert robot.stiffness > 0 and robot.damping > 0 and robot.force_limit_n > 0
-    assert robot.urdf.is_file()
     limits = robot_limits(robot.name)
     assert robot.reach_m == pytest.approx(np.clip(robot.reach_m, *limits.reach_m), abs=1e-3)
     assert robot.base_radius_m == limits.base_radius_m
