@@ -82,7 +82,7 @@ submit test-grid $((TEST_SCENES * CELLS)) test 5 test sim --candidates grid
 if ! [ -f "$OUT/rule.toml" ]; then
     step "calibrate"
     datagen calibrate "$OUT/runs/val-in-range" "$OUT/runs/val-clear" --out "$OUT/rule.toml" \
-        --candidates in-range --distance "$FORM" --split-check
+        --candidates in-range --distance "$FORM"
 fi
 step "relabel"
 datagen relabel "$OUT/runs/heuristic" --config "$OUT/rule.toml" --out "$OUT/runs/calibrated"

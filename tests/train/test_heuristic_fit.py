@@ -19,10 +19,8 @@ from datagen.train.heuristic_fit import (
     begin_from,
     fit,
     fit_leaving_houses_out,
-    reach_in_sigmas,
     refuse_too_little,
 )
-from datagen.workers.labels.distance_visibility_score import visibility_score
 
 BEFORE = HeuristicParams()
 N, SCENES = 600, 30
@@ -75,34 +73,23 @@ hidden_rules = st.builds(
 )
 
 
-@given(hidden_rules, st.integers(0, 1000), st.sampled_from(["balanced", "accuracy"]))
+@given(hidden_rules, st.integers(0, 1000))
 @settings(max_examples=4, deadline=None)
-def test_labels_of_a_hidden_rule_are_found_again(hidden: HeuristicParams, seed: int, objective: Any) -> None:
+def test_labels_of_a_hidden_rule_are_found_again(hidden: HeuristicParams, seed: int) -> None:
     trials = labelled_by(make_trials(seed), hidden)
     if trials.label.sum() < 20:
         return  # nothing but luck says where so few come from
-    found = fit(trials, BEFORE, [hidden.distance], objective)
+    found = fit(trials, BEFORE, [hidden.distance])
     assert share_equal(trials.labels_by(found), trials.label) > 0.99
     assert (found.distance, found.alpha, found.a) == (hidden.distance, hidden.alpha, hidden.a)
     assert (found.d_min, found.d_max) == (hidden.d_min, hidden.d_max)
 
 
-def test_a_hidden_rule_of_another_weight_and_form_is_found_too() -> None:
-    hidden = begin_from(BEFORE, "mount-over-reach").model_copy(
-        update={"mu": 0.7, "sigma_l": 0.3, "sigma_r": 0.15, "alpha": 0.3, "tau": 0.45}
-    )
-    trials = labelled_by(make_trials(3), hidden)
-    found = fit(trials, BEFORE, ["planar", "mount-over-reach"], fit_alpha=True)
-    assert found.distance == hidden.distance
-    assert share_equal(trials.labels_by(found), trials.label) > 0.99
-
-
-@pytest.mark.parametrize("objective", ["balanced", "accuracy"])
-def test_row_order_does_not_change_the_fit(objective: Any) -> None:
+def test_row_order_does_not_change_the_fit() -> None:
     trials = make_trials(4, n=240)
     other = permuted(trials, np.random.default_rng(5).permutation(len(trials)))
-    fitted = fit(trials, BEFORE, ["planar"], objective)
-    assert fitted == fit(other, BEFORE, ["planar"], objective) == fit(trials, BEFORE, ["planar"], objective)
+    fitted = fit(trials, BEFORE, ["planar"])
+    assert fitted == fit(other, BEFORE, ["planar"]) == fit(trials, BEFORE, ["planar"])
 
 
 @given(st.integers(0, 1000))
@@ -115,12 +102,12 @@ def test_row_order_does_not_change_the_report(seed: int) -> None:
     def refit(some: Trials) -> HeuristicParams:
         return BEFORE.model_copy(update={"mu": float(np.median(some.distance_m[some.label]))})
 
-    ours, theirs = (fit_leaving_houses_out(t, refit, seed) for t in (trials, other))
+    ours, theirs = (fit_leaving_houses_out(t, refit) for t in (trials, other))
     assert ours.params == theirs.params
     np.testing.assert_array_equal(ours.labels[order], theirs.labels)
-    a, b = (agreements(t, [left.labels], 50, seed)[0] for t, left in ((trials, ours), (other, theirs)))
-    np.testing.assert_array_equal(a.confusion, b.confusion)
-    np.testing.assert_array_equal(a.balanced_accuracy.resamples, b.balanced_accuracy.resamples)
+    a, b = (agreements(t, [left.labels])[0][1] for t, left in ((trials, ours), (other, theirs)))
+    assert a.value == b.value
+    np.testing.assert_array_equal(a.resamples, b.resamples)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -132,7 +119,7 @@ def test_no_random_rule_does_better_than_the_fitted_one(form: Any) -> None:
     trials = replace(trials, label=near)
 
     def balanced(params: HeuristicParams) -> float:
-        return agreements(trials, [trials.labels_by(params)], 1, 0)[0].balanced_accuracy.value
+        return float(trials.gains() @ trials.labels_by(params))
 
     start = begin_from(BEFORE, form)
     guesses = (
@@ -142,30 +129,17 @@ def test_no_random_rule_does_better_than_the_fitted_one(form: Any) -> None:
     assert balanced(fit(trials, BEFORE, [form])) >= max(map(balanced, guesses))
 
 
-@given(st.floats(0, 1), st.floats(0.31, 0.7), st.floats(0, 2))
-@settings(max_examples=50, deadline=None)
-def test_at_reach_in_sigmas_the_score_is_tau(rho: float, tau: float, sigmas: float) -> None:
-    params = BEFORE.model_copy(update={"tau": tau})
-    visible = visibility_score(np.array([rho]))
-    k = reach_in_sigmas(visible, params)[0]
-    score = params.alpha * visible[0] + (1 - params.alpha) * np.exp(-0.5 * sigmas**2)
-    if np.isnan(k):
-        assert params.alpha * visible[0] + (1 - params.alpha) < tau
-    elif abs(sigmas - k) > 1e-6:
-        assert (score > tau) == (sigmas < k)
-
-
 def test_every_house_is_labelled_by_a_rule_fitted_on_other_houses() -> None:
     trials, seen = labelled_by(make_trials(1), BEFORE), list[set[str]]()
 
     def refit(some: Trials) -> HeuristicParams:
         seen.append(set(some.house[np.unique(some.scene)]))
-        assert len(some.house) == some.n_scenes == len(np.unique(some.scene))
+        assert len(some.house) == len(np.unique(some.scene))
         # A rule that is known by its mu: it says which fold it was fitted for.
         return BEFORE.model_copy(update={"mu": 0.1 * len(seen)})
 
     steps = list[int]()
-    left_out = fit_leaving_houses_out(trials, refit, 0, lambda: steps.append(1))
+    left_out = fit_leaving_houses_out(trials, refit, lambda: steps.append(1))
     assert len(steps) == len(left_out.params) == 5
     for k, (houses, params) in enumerate(zip(seen, left_out.params, strict=True)):
         unseen = np.array([trials.house[s] not in houses for s in trials.scene])
@@ -180,31 +154,18 @@ def test_overfitting_to_noise_shows_only_on_the_fitted_houses() -> None:
     def refit(some: Trials) -> HeuristicParams:
         return fit(some, BEFORE, ["planar"])
 
-    left_out = fit_leaving_houses_out(trials, refit, 0).labels
-    fitted, unseen = agreements(trials, [trials.labels_by(refit(trials)), left_out], 200, 0)
-    assert fitted.balanced_accuracy.interval()[0] > 0.5
-    low, high = unseen.balanced_accuracy.interval()
+    left_out = fit_leaving_houses_out(trials, refit).labels
+    (_, fitted), (_, unseen) = agreements(trials, [trials.labels_by(refit(trials)), left_out])
+    assert fitted.interval()[0] > 0.5
+    low, high = unseen.interval()
     assert low < 0.5 < high
-
-
-def test_other_seeds_give_other_folds() -> None:
-    trials, seen = labelled_by(make_trials(1), BEFORE), list[frozenset[str]]()
-
-    def refit(some: Trials) -> HeuristicParams:
-        seen.append(frozenset(some.house))
-        return BEFORE
-
-    for seed in (0, 0, 1):
-        fit_leaving_houses_out(trials, refit, seed)
-    assert seen[:5] == seen[5:10] and set(seen[:5]) != set(seen[10:])
 
 
 def test_a_correct_rule_keeps_its_agreement() -> None:
     trials = labelled_by(make_trials(2), BEFORE)
-    right, wrong = agreements(trials, [trials.labels_by(BEFORE), ~trials.label], 20, 0)
-    assert right.accuracy.value == right.balanced_accuracy.value == 1
-    assert right.accuracy.interval() == (1, 1) and wrong.accuracy.interval() == (0, 0)
-    assert right.confusion.tolist() == [trials.label.sum(), 0, 0, (~trials.label).sum()]
+    right, wrong = agreements(trials, [trials.labels_by(BEFORE), ~trials.label])
+    assert [estimate.value for estimate in right] == [1, 1]
+    assert right[0].interval() == (1, 1) and wrong[0].interval() == (0, 0)
 
 
 @pytest.mark.parametrize(
@@ -226,4 +187,4 @@ def test_a_class_in_one_house_alone_is_refused() -> None:
     trials = make_trials(0)
     label = np.array([trials.house[s] == "house-3" for s in trials.scene])
     with pytest.raises(InputError, match="too few houses"):
-        fit_leaving_houses_out(replace(trials, label=label), lambda _: BEFORE, 0)
+        fit_leaving_houses_out(replace(trials, label=label), lambda _: BEFORE)
