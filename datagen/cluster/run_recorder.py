@@ -1,41 +1,25 @@
-"""Records how the attempts of a run ended, its quarantined shards and lost attempts; keeps its index."""
+"""Records how the attempts of a run ended, its quarantined shards and lost attempts."""
 
 from __future__ import annotations
 
-import time
-
 from datagen.cluster.shard_policy import ShardFailures
-from datagen.schemas.errors import InputError
 from datagen.schemas.keys import commit_key
 from datagen.schemas.ledger import end_from_commit, lost_end
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, LedgerEntry, QuarantineRecord
 from datagen.schemas.shard_ranges import ShardRanges
-from datagen.schemas.summaries import refresh
-
-# The index is updated after this many attempts, and at the earliest after this multiple of the duration of
-# the last update, so that it takes a small share of the driver's time.
-_INDEX_EVERY = 500
-_INDEX_FACTOR = 30.0
 
 
 class RunRecorder:
-    """Writes the ledger, the quarantine and, at intervals, the index of one run."""
+    """Writes the ledger and the quarantine of one run."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        self._since_index, self._index_s = 0, time.monotonic()
 
     def close(self, entry: LedgerEntry) -> None:
         """Record how an attempt ended. An earlier record is kept, unless it was a guess."""
         self._run.ledger.end(entry)
-        self._since_index += 1
-        if self._since_index >= _INDEX_EVERY and time.monotonic() >= self._index_s:
-            start_s = time.monotonic()
-            refresh_index(self._run)
-            end_s = time.monotonic()
-            self._since_index, self._index_s = 0, end_s + _INDEX_FACTOR * (end_s - start_s)
 
     def quarantine(self, shard: int, trouble: ShardFailures) -> None:
         scenes = self._run.layout.scenes_per_shard
@@ -59,18 +43,10 @@ class RunRecorder:
         return self._run.missing()
 
 
-def refresh_index(run: Run) -> None:
-    """Update the run's index where possible."""
-    try:
-        refresh(run)
-    except InputError:
-        return  # for example on a full disk; without the index, reports only take longer
-
-
 def close_lost_attempts(run: Run) -> int:
     """Write end records for attempts of killed drivers; return their number.
 
-    Call it when a job has ended; it also updates the run's index. The worker of a killed driver may outlive
+    Call it when a job has ended. The worker of a killed driver may outlive
     it and still commit, so an attempt is closed only once its shard is decided: the committed one with the
     commit's cost, others as lost with unknown cost. If the driver is still running, its own record replaces
     this one. Attempts of open shards stay open for the job that resumes.
@@ -85,5 +61,4 @@ def close_lost_attempts(run: Run) -> int:
         else:
             recorder.close(lost_end(start, utc_now()))
         closed += 1
-    refresh_index(run)
     return closed

@@ -12,9 +12,9 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS, RecordSchema, SceneRows
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit
 from datagen.schemas.shard_reading import Array, ShardPlace, StoredArray, committed_place
 from datagen.schemas.specification import Specification
-from datagen.schemas.summaries import CommitSummary, Summaries
 from datagen.train.run_parts import is_sealed_store, open_sealed
 
 _FIX = "Name runs, checkpoints of `datagen train`, and documents of `datagen evaluate --json`"
@@ -36,9 +36,9 @@ class ReportedPart:
     slices: Mapping[int, ShardPlace]  # of a sealed store
 
     @cached_property
-    def commits(self) -> dict[int, CommitSummary]:
-        """Summaries of the commits by shard; empty for a sealed store."""
-        return {} if self.run is None else {c.shard: c for c in Summaries(self.run).commits()}
+    def commits(self) -> dict[int, Commit]:
+        """The commits by shard; empty for a sealed store."""
+        return {} if self.run is None else {c.shard: c for c in self.run.commits()}
 
     @property
     def spec(self) -> Specification:

@@ -10,7 +10,6 @@ from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lifted_records
 from datagen.schemas.run import Run
 from datagen.schemas.storage import Storage
-from datagen.schemas.summaries import Summaries
 
 _GOOD = ("committed", "superseded")
 
@@ -66,17 +65,18 @@ def _job_events(storage: Storage) -> list[Event]:
 
 
 def _attempt_events(run: Run, part: str) -> list[Event]:
-    summaries, events = Summaries(run), list[Event]()
-    bad = [end for end in summaries.ends() if end.outcome not in _GOOD]
+    ends, events = {end.attempt: end for end in run.ledger.ends()}, list[Event]()
+    bad = [end for end in ends.values() if end.outcome not in _GOOD]
     shards, ended = {end.shard for end in bad}, {end.attempt for end in bad}
-    attempts = {end.attempt: end.shard for end in summaries.ends()}
-    attempts |= {start.attempt: start.shard for start in summaries.unfinished()}
+    attempts = {end.attempt: end.shard for end in ends.values()}
+    attempts |= {start.attempt: start.shard for start in run.ledger.unfinished()}
     for attempt in sorted(attempt for attempt, shard in attempts.items() if shard in shards):
         start = run.ledger.start_of(attempt)
         if start is not None and start.started:  # else no worker began it, or the time is unknown
             text = f"{part}shard {start.shard} begins on {start.host or 'an unknown host'} ({attempt})"
             events.append(Event(start.started, "attempt_begins", text, "", start.shard))
-        if attempt in ended and (end := run.ledger.end_of(attempt)) is not None:
+        if attempt in ended:
+            end = ends[attempt]
             cause = f": {end.cause}" if end.cause else ""
             text = f"{part}shard {end.shard} {end.outcome}{cause} ({attempt})"
             events.append(Event(end.ended, f"attempt_{end.outcome}", text, end.stack, end.shard))

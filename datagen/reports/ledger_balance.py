@@ -12,8 +12,7 @@ from datagen.schemas.keys import commit_key
 from datagen.schemas.ledger import end_key
 from datagen.schemas.record_files import REPAIR
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Cost, other_value
-from datagen.schemas.summaries import CommitSummary, EndSummary, Summaries
+from datagen.schemas.run_records import Commit, Cost, LedgerEntry, other_value
 
 _OR_RUNNING = f"{REPAIR}; or audit again where a job is running"
 
@@ -45,12 +44,11 @@ def balance(runs: Iterable[Run]) -> Balance:
     waste: list[Cost] = []
     findings: list[Finding] = []
     for run in runs:
-        summaries = Summaries(run)
-        ends = {end.attempt: end for end in summaries.ends()}
-        committed = {commit.attempt: commit for commit in summaries.commits()}
+        ends = {end.attempt: end for end in run.ledger.ends()}
+        committed = {commit.attempt: commit for commit in run.commits()}
         for attempt in committed.keys() - ends.keys():  # it ended after the ledger was listed, or not at all
             if (late := run.ledger.end_of(attempt)) is not None:
-                ends[attempt] = EndSummary.model_validate(late, from_attributes=True)
+                ends[attempt] = late
         ledger += [end.cost for end in ends.values() if end.cost]
         commits += [commit.cost for commit in committed.values()]
         waste += [end.cost for end in ends.values() if end.cost and end.attempt not in committed]
@@ -68,7 +66,7 @@ def _clock(costs: Iterable[Cost], clock: str) -> list[float]:
     return [cost.wall_s if clock == "wall" else cost.cpu_s for cost in costs]
 
 
-def _findings(committed: dict[str, CommitSummary], ends: dict[str, EndSummary]) -> Iterator[Finding]:
+def _findings(committed: dict[str, Commit], ends: dict[str, LedgerEntry]) -> Iterator[Finding]:
     """Records of committed attempts that differ from their commit, ends without commit, and odd costs."""
     for attempt, commit in sorted(committed.items(), key=lambda item: item[1].shard):
         end, key, ours = ends.get(attempt), end_key(attempt), commit_key(commit.shard)

@@ -14,7 +14,6 @@ from datagen.schemas.run_records import Outcome
 from datagen.schemas.sealing import SealedPart, SealedRoot, sealed_root
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage
-from datagen.schemas.summaries import Summaries
 
 _SHOWN = 20  # causes and stacks
 _GOOD = ("committed", "superseded", "cancelled")
@@ -37,13 +36,14 @@ def runs_report(storage: Storage, stacks: bool = False) -> dict[str, Any]:
 
 def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False) -> dict[str, Any]:
     """Return the status of a run. `root` describes the store that holds it, by default its own."""
-    summaries, n = Summaries(run), run.n
-    planned, committed = ShardRanges.of(range(run.layout.shards_for(n))), ShardRanges.of(summaries.shards)
+    # The ledger before the commits: every attempt that it calls committed then has its commit.
+    ends, begun, n = list(run.ledger.ends()), run.ledger.unfinished(), run.n
+    planned, committed = ShardRanges.of(range(run.layout.shards_for(n))), ShardRanges.of(run.committed())
     quarantine = run.quarantine_records()
     quarantined = [record.shard for record in quarantine]
     labels = labels_made = positives = 0
     winners: set[str] = set()
-    for commit in summaries.commits():
+    for commit in run.commits():
         labels += run.layout.rows_wanted(commit.shard, n)[1]
         labels_made += commit.samples
         positives += commit.positives
@@ -52,7 +52,7 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
     causes: Counter[str] = Counter()
     examples: dict[str, str] = {}  # an attempt of each cause
     spent: dict[Outcome, Counter[int]] = {}  # attempts by shard
-    for entry in summaries.ends():
+    for entry in ends:
         outcomes[entry.outcome] += 1
         if entry.outcome not in _GOOD:
             spent.setdefault(entry.outcome, Counter())[entry.shard] += 1
@@ -60,7 +60,7 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
             cause = f"{entry.outcome}: {entry.cause}"
             causes[cause] += 1
             examples.setdefault(cause, entry.attempt)
-    unfinished = {start.attempt for start in summaries.unfinished()} - winners
+    unfinished = {start.attempt for start in begun} - winners
     root = root or sealed_root(run.storage)
     absent, part = planned.without(committed), root.part(run.manifest.spec_hash) if root else None
     common = dict(causes.most_common(_SHOWN))

@@ -9,7 +9,6 @@ from math import fsum
 
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost
-from datagen.schemas.summaries import Summaries
 
 QUARANTINED = "quarantined"
 
@@ -98,8 +97,10 @@ def account_for(runs: Iterable[Run]) -> Spending:
     """
     spending = Spending()
     for run in runs:
-        summaries, committed, quarantined = Summaries(run), set[str](), run.quarantined()
-        for commit in summaries.commits():
+        # Before the commits: every attempt that the ledger calls committed then has its commit.
+        ends, unfinished = list(run.ledger.ends()), run.ledger.unfinished()
+        committed, quarantined = set[str](), run.quarantined()
+        for commit in run.commits():
             committed.add(commit.attempt)
             spending.labels += commit.samples
             spending.positives += commit.positives
@@ -107,10 +108,10 @@ def account_for(runs: Iterable[Run]) -> Spending:
             spending.redraws.update(commit.redraws)
             spending.useful.add(commit.cost)
             spending.machines[f"{commit.host.cpu}, {commit.host.cores} cores"] += 1
-        for entry in summaries.ends():
+        for entry in ends:
             if entry.attempt not in committed:
                 kind = QUARANTINED if entry.shard in quarantined else entry.outcome
                 spending.waste.setdefault(kind, Account()).add(entry.cost)
                 spending.causes.setdefault((entry.outcome, entry.cause), Account()).add(entry.cost)
-        spending.running += sum(start.attempt not in committed for start in summaries.unfinished())
+        spending.running += sum(start.attempt not in committed for start in unfinished)
     return spending

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import secrets
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import encode_record, read_record, read_records, utc_now
@@ -54,7 +54,7 @@ class Ledger:
         return True
 
     def attempts(self) -> set[str]:
-        return {name.removesuffix(".start") for name in self.stamps()}
+        return {name.removesuffix(".start") for name in self._names()}
 
     def start_of(self, attempt: str) -> AttemptStart | None:
         return read_record(self._storage, start_key(attempt), AttemptStart)
@@ -64,20 +64,20 @@ class Ledger:
         return read_record(self._storage, end_key(attempt), LedgerEntry)
 
     def ends(self) -> Iterator[LedgerEntry]:
-        names = sorted(name for name in self.stamps() if not name.endswith(".start"))
+        names = sorted(name for name in self._names() if not name.endswith(".start"))
         return read_records(self._storage, map(end_key, names), LedgerEntry)
 
-    def unfinished(self, stamps: Mapping[str, str] | None = None) -> list[AttemptStart]:
-        """Start records of attempts without an end: running, or lost. `stamps` saves a listing."""
-        names = self.stamps() if stamps is None else stamps
+    def unfinished(self) -> list[AttemptStart]:
+        """Start records of attempts without an end: running, or lost."""
+        names = self._names()
         began = (name.removesuffix(".start") for name in names if name.endswith(".start"))
         open_ = sorted(attempt for attempt in began if attempt not in names)
         return list(read_records(self._storage, map(start_key, open_), AttemptStart))
 
-    def stamps(self) -> dict[str, str]:
-        """Change stamps of all records by their names, by listing; those of starts end in `.start`."""
+    def _names(self) -> set[str]:
+        """Names of all records, by listing; those of starts end in `.start`."""
         return {
-            file.key[len("ledger/") : -len(".json")]: file.stamp
+            file.key[len("ledger/") : -len(".json")]
             for file in self._storage.list("ledger")
             if file.key.endswith(".json")
         }

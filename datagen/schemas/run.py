@@ -160,13 +160,9 @@ class Run:
     def committed(self) -> set[int]:
         return self._numbers("commits")
 
-    def commit_stamps(self) -> dict[str, str]:
-        """Change stamps of all commit records by their names (the shard in six digits), by listing."""
-        return dict(self._numbered("commits"))
-
     def missing(self) -> ShardRanges:
         """Planned shards that are neither committed nor quarantined, in order."""
-        decided = (int(name) for folder in ("commits", "quarantine") for name, _ in self._numbered(folder))
+        decided = self._numbers("commits") | self._numbers("quarantine")
         return ShardRanges.of(self.planned()).without(ShardRanges.of(decided))
 
     def commit_of(self, shard: int) -> Commit:
@@ -263,12 +259,8 @@ class Run:
         return list(read_records(self.storage, keys, QuarantineRecord))
 
     def _numbers(self, folder: str, width: int = 6) -> set[int]:
-        return {int(name) for name, _ in self._numbered(folder, width)}
-
-    def _numbered(self, folder: str, width: int = 6) -> Iterator[tuple[str, str]]:
-        """(name, change stamp) of a folder's records whose name is a number."""
-        for file in self.storage.list(folder):
-            name = file.key.removeprefix(f"{folder}/")
-            # Only names in the form that is written: no drafts, and not "7.json" for "000007.json".
-            if (found := _NUMBERED.fullmatch(name)) and name == f"{int(found.group(1)):0{width}d}.json":
-                yield found.group(1), file.stamp
+        """Numbers of a folder's records, by listing."""
+        names = (file.key.removeprefix(f"{folder}/") for file in self.storage.list(folder))
+        numbered = ((name, int(found[1])) for name in names if (found := _NUMBERED.fullmatch(name)))
+        # Only names in the form that is written: no drafts, and not "7.json" for "000007.json".
+        return {number for name, number in numbered if name == f"{number:0{width}d}.json"}

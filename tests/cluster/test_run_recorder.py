@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
-import datagen.cluster.run_recorder
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.shard_policy import ShardFailures
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, LedgerEntry
-from datagen.schemas.summaries import index_files, refresh
 from tests.made_runs import make_run, write
 
 TROUBLE = ShardFailures(attempts=("a", "b"), causes=("failed: x", "hung: y"), stacks=("at x", ""))
@@ -62,36 +58,6 @@ def test_what_is_closed_says_all_that_is_known(tmp_path: Path) -> None:
     assert lost.cause == "it left no end record, and its shard was decided without it"
     assert (lost.cost, lost.host, lost.started) == (None, None, starts["lost"].started)
     assert lost.ended >= lost.started > ""
-
-
-def test_a_job_that_has_ended_leaves_a_whole_index(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run")
-    assert index_files(run) == [] and close_lost_attempts(run) == 0
-    assert index_files(run) != [] and refresh(run) == 0
-
-
-def test_an_index_that_cannot_be_written_keeps_no_job_from_its_end(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", shards=[0])
-    run.ledger.start("lost", 0)
-    (tmp_path / "run/index").write_bytes(b"in the way")
-    assert close_lost_attempts(run) == 1 and ends(run)["lost"].outcome == "lost"
-
-
-@pytest.mark.parametrize(("factor", "left_out"), [(0.0, 0), (1e9, 3)])  # times what it took the last time
-def test_the_index_follows_a_long_job_now_and_then(
-    factor: float, left_out: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(datagen.cluster.run_recorder, "_INDEX_FACTOR", factor)
-    monkeypatch.setattr(datagen.cluster.run_recorder, "_INDEX_EVERY", 3)
-    run = make_run(tmp_path / "run", shards=())
-    recorder, indexed = RunRecorder(run), list[bool]()
-    for shard in range(3):
-        recorder.close(LedgerEntry(attempt=f"a-{shard}", shard=shard, outcome="failed"))
-        indexed.append(bool(index_files(run)))
-    assert indexed == [False, False, True]
-    for shard in range(3):
-        recorder.close(LedgerEntry(attempt=f"b-{shard}", shard=shard, outcome="failed"))
-    assert refresh(run) == left_out
 
 
 def test_a_shard_in_quarantine_can_be_run_alone(tmp_path: Path) -> None:

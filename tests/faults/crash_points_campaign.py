@@ -209,7 +209,7 @@ def _try(
     _judge(now, known, finding, violated, ended)
     if _lasting(resumed) != _lasting(known.after):
         violated(f"resumed to something else: {_different(resumed, known.after)}")
-    other = {name for name in files_below(place).keys() ^ known.after_files.keys() if "index/" not in name}
+    other = files_below(place).keys() ^ known.after_files.keys()
     if operation.exact and other:
         violated(f"resumed with other files: {sorted(other)}")
     for what in damaged:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 
-from datagen.cluster.run_recorder import close_lost_attempts, refresh_index
+from datagen.cluster.run_recorder import close_lost_attempts
 from datagen.relabelling import relabel_all, relabelled_specification
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.cleaning import clean_runs
@@ -23,7 +23,6 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout, LedgerEntry, Merged, QuarantineRecord
 from datagen.schemas.sealing import SEALED, seal, unseal
 from datagen.schemas.storage import open_storage
-from datagen.schemas.summaries import Summaries
 from tests.made_runs import attempt, check_digests, files_of, make_run, manifest_of, small_spec, write
 
 # A shard of few files, so that every call of every operation can be tried. All that these tests and the
@@ -95,20 +94,7 @@ def _units(folder: Path) -> Units:
             found[f"ledger {name} end {entry.attempt}"] = entry.outcome
         for start in run.ledger.unfinished():
             found[f"ledger {name} begun {start.attempt}"] = str(start.shard)
-        if listed := _wrongly_listed(run):
-            found[f"{name} index"] = listed
     return found
-
-
-def _wrongly_listed(run: Run) -> str:
-    """In what the index differs from the records."""
-    try:
-        summaries = Summaries(run)
-        listed = [found.shard for found in summaries.commits()], [end.attempt for end in summaries.ends()]
-    except InputError as e:
-        return f"refused: {e.problem}"
-    told = sorted(run.committed()), [entry.attempt for entry in run.ledger.ends()]
-    return "" if listed == told else f"{listed}, not {told}"
 
 
 def damage(folder: Path, places: Iterable[str] = ("",)) -> list[str]:
@@ -284,7 +270,6 @@ OPERATIONS = (
     Operation("seal again", _sealed_and_grown, _seal),
     Operation("seal merged", _merged, _seal),
     Operation("unseal", _sealed_and_grown, lambda folder: unseal(open_storage(folder, probe=False))),
-    Operation("index", lambda folder: _run(folder, 40, None), lambda folder: refresh_index(Run.open(folder))),
     Operation("merge one", lambda f: _apart(f, (0, 0)), _merge, places=("out",), shared=True),
     Operation("merge several", lambda f: _apart(f, (0, 1)), _merge, places=("out",), shared=True),
     Operation("repair manifest", _damaged_manifest, _repair),

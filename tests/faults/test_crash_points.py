@@ -47,7 +47,6 @@ def test_every_unit_is_absent_or_there_wherever_it_ends(library: Path) -> None:
     assert [found.operation for found in findings] == [operation.name for operation in OPERATIONS]
     for found in findings:
         assert found.violations == [], found.operation
-        # The smallest, `index`, opens a file, writes it and renames it.
         assert found.calls >= 5, found.operation
         assert found.absent + found.there + found.between == found.points
     # The sample has points of every kind: some before the unit is there, some after, some refused.

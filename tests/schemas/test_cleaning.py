@@ -20,7 +20,6 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import Merged
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage, open_storage
-from datagen.schemas.summaries import refresh
 from tests.made_runs import attempt, check_digests, files_of, make_run, small_spec, write
 
 HOUR_S = 3600
@@ -33,13 +32,11 @@ def littered(folder: Path | str) -> tuple[Run, set[str]]:
     write(run, 3, "never-committed")
     run.ledger.start("never-committed", 3)
     seal(run.storage)
-    refresh(run)
     keys = {
         f"commits/000007.json.{'a' * 16}.part",
         f"{shard_folder(0, 'a-0')}/zarr.json.{'b' * 16}.part",
         f".probe-{'c' * 16}",
         f"data.zarr.{'d' * 16}.partial/label/c.0",
-        "index/9.json.gz",
     }
     for key in keys:
         run.storage.put(key, b"left behind")
@@ -54,7 +51,7 @@ def age(run: Run, keys: Iterable[str], seconds: float) -> None:
 
 
 def kept(folder: Path, garbage: Iterable[str] = ()) -> dict[str, bytes]:
-    return {k: data for k, data in files_of(folder).items() if k not in set(garbage) and k[:6] != "index/"}
+    return {k: data for k, data in files_of(folder).items() if k not in set(garbage)}
 
 
 def test_garbage_is_removed_and_everything_else_keeps_its_bytes(tmp_path: Path) -> None:
@@ -150,6 +147,4 @@ def test_merged_runs_and_runs_on_s3_are_cleaned_as_on_a_disk(tmp_path: Path, buc
     storage.put(f".probe-{'c' * 16}", b"")
     before = kept(tmp_path, [f".probe-{'c' * 16}"])
     clean_runs(storage, kept_s=-60)
-    assert {k: v for k, v in kept(tmp_path).items() if "/index/" not in k} == {
-        k: v for k, v in before.items() if "/late/" not in k
-    }
+    assert kept(tmp_path) == {k: v for k, v in before.items() if "/late/" not in k}

@@ -191,8 +191,8 @@ def test_what_lies_there_without_a_root_is_no_store_and_is_no_hindrance(place: S
 def test_a_missing_file_is_refused_before_anything_changes(place: Storage) -> None:
     make(place, 20)
     seal(place)
-    before = {f.key: f.stamp for f in place.list(SEALED)}
+    before = {f.key: f.modified_s for f in place.list(SEALED)}
     place.delete(["shards/000001/a-1/label/c.0"])
     with pytest.raises(InputError, match=r"label/c\.0: is missing"):
         seal(place)
-    assert {f.key: f.stamp for f in place.list(SEALED)} == before
+    assert {f.key: f.modified_s for f in place.list(SEALED)} == before

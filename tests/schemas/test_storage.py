@@ -35,17 +35,6 @@ def test_files_come_back_and_listing_tells_their_sizes(tmp_path: Path):
     assert (s.exists("a/b"), s.exists("x/y")) == (False, True)
 
 
-def test_stamps_change_with_the_bytes_and_with_nothing_else(tmp_path: Path):
-    s = open_storage(tmp_path)
-    s.put("a/b", b"12")
-    s.put("a/c", b"12")
-    before = {f.key: f.stamp for f in s.list("")}
-    assert before == {f.key: f.stamp for f in s.list("")} and all(before.values())
-    s.put("a/b", b"13")
-    after = {f.key: f.stamp for f in s.list("")}
-    assert after["a/c"] == before["a/c"] and after["a/b"] != before["a/b"]
-
-
 def test_a_file_of_another_storage_is_adopted_by_a_link(tmp_path: Path):
     ours, theirs = open_storage(tmp_path / "ours"), open_storage(tmp_path / "theirs")
     theirs.put("x/y", b"theirs")

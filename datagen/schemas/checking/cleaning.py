@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import timedelta
@@ -20,7 +20,6 @@ from datagen.schemas.keys import commit_copy_key, commit_key
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
 from datagen.schemas.storage import Storage, StoredFile
-from datagen.schemas.summaries import refresh, unreadable_files
 
 Seen = Callable[[int, int], None]
 _KEPT_S = 3600.0
@@ -66,7 +65,6 @@ def clean_runs(storage: Storage, seen: Seen = lambda done, of: None, kept_s: flo
     before_s, cleaned, runs = time.time() - kept_s, Cleaned(), open_runs(storage)
     for run in runs:
         _clean_run(run, before_s, seen, cleaned)
-        refresh(run)
     if all(run.storage.url != storage.url for run in runs):  # merged runs
         rest = [file for file in storage.list("") if not file.key.startswith("parts/")]
         _clean_files(storage, rest, before_s, cleaned)
@@ -80,11 +78,11 @@ def _clean_run(run: Run, before_s: float, seen: Seen, cleaned: Cleaned) -> None:
         for file in storage.list("ledger")
         if file.key.endswith(".start.json")
     }
-    unreadable, committed, searched = set(unreadable_files(run)), len(run.committed()), 0
+    committed, searched = len(run.committed()), 0
     for key, group in groupby(storage.list(""), key=_folder_of):
         files = list(group)
         if not (found := _ATTEMPT.fullmatch(f"{key}/")):
-            _clean_files(storage, files, before_s, cleaned, unreadable)
+            _clean_files(storage, files, before_s, cleaned)
             continue
         shard, attempt = int(found[1]), found[2]
         searched += 1
@@ -122,14 +120,12 @@ def _clean_files(
     files: list[StoredFile],
     before_s: float,
     cleaned: Cleaned,
-    unreadable: Container[str] = (),
 ) -> None:
-    """Remove garbage outside the folders of attempts: drafts, probes, and unreadable indices."""
+    """Remove garbage outside the folders of attempts: drafts and probes."""
     old = [
         file
         for file in files
-        if file.modified_s < before_s
-        and (file.key in unreadable or any(kind.match(file.key) for kind in (_PROBE, _DRAFT, _STORE_DRAFT)))
+        if file.modified_s < before_s and any(kind.match(file.key) for kind in (_PROBE, _DRAFT, _STORE_DRAFT))
     ]
     _remove(storage, old, cleaned)
     for folder in {found[1] for file in old if (found := _STORE_DRAFT.match(file.key))}:

@@ -44,15 +44,13 @@ _KINDS = {
 
 @dataclass(frozen=True, slots=True)
 class StoredFile:
-    """One listed file: its key below the storage's root, its size in bytes, and its change stamp.
+    """One listed file: its key below the storage's root, its size in bytes, and the time of its last write.
 
-    Equal stamps of one key mean equal bytes: the store's entity tag, or inode, time of change and size of a
-    file. `modified_s` is the time of the last write, in seconds since 1970 UTC.
+    `modified_s` is in seconds since 1970 UTC.
     """
 
     key: str
     size: int
-    stamp: str = ""
     modified_s: float = 0.0
 
 
@@ -226,8 +224,7 @@ class LocalFiles:
                         yield from self._list(below, f"{key}/", depth + 1)
                 else:
                     self._refuse_odd(seen.st_mode, key)
-                    stamp = f"{seen.st_ino:x}-{seen.st_ctime_ns:x}-{seen.st_size:x}"
-                    yield StoredFile(key, seen.st_size, stamp, seen.st_mtime)
+                    yield StoredFile(key, seen.st_size, seen.st_mtime)
 
     def _refuse_odd(self, mode: int, key: str, where: str = "") -> None:
         kind = _KINDS.get(stat.S_IFMT(mode))

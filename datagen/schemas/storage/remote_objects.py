@@ -105,8 +105,7 @@ class RemoteObjects:
         while (entries := self._try(prefix, page)) is not None:
             for entry in entries:
                 last = str(entry["path"])
-                stamp = entry["e_tag"] or f"{entry['last_modified'].isoformat()}-{entry['size']}"
-                yield StoredFile(last, int(entry["size"]), str(stamp), entry["last_modified"].timestamp())
+                yield StoredFile(last, int(entry["size"]), entry["last_modified"].timestamp())
 
     def delete(self, keys: Iterable[str]) -> None:
         left = iter(keys)

@@ -13,7 +13,6 @@ from datagen.html_report import part_columns
 from datagen.html_report.part_columns import PartColumns, chosen_shards, read_columns
 from datagen.html_report.report_paths import ReportedPart, open_report_paths
 from datagen.html_report.run_figures import angles_deg, rate_by_scene
-from datagen.schemas.summaries import Summaries
 from tests.made_runs import make_run
 from tests.small_runs import PER_SCENE, arrays_of
 
@@ -109,9 +108,3 @@ def test_intervals_of_extreme_rates_are_exact(reported: Path) -> None:
         exact = binomtest(k, 10).proportion_ci(method="exact")
         assert rate_by_scene(columns, every) == pytest.approx((label, exact.low, exact.high))
     assert np.isnan(rate_by_scene(columns_of(reported), ~every)).all()
-
-
-def test_commits_are_read_by_their_summaries(reported: Path) -> None:
-    part = part_of(reported)
-    assert part.run is not None
-    assert part.commits == {c.shard: c for c in Summaries(part.run).commits()} and len(part.commits) == 10
