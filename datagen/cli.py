@@ -38,44 +38,49 @@ if TYPE_CHECKING:
 
 EXIT_GOOD, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 0, 2, 130, 141
 
-# Verb -> (where it is defined, its line in --help). A verb returns an exit code, or None for 0. If it is also
-# a Python function, it returns its result, and `prints` names the function that prints it.
-VERBS: dict[str, tuple[str, str]] = {
-    "submit": ("datagen.commands.submit:submit", "Make labels: start a run, or resume it."),
-    "resume": ("datagen.commands.resume:resume", "Make the missing labels of a run; extend it."),
-    "cancel": ("datagen.commands.cancel:cancel", "Ask the jobs of a run to stop and wait until they have."),
-    "status": ("datagen.commands.status:status", "Show the progress, the failures and the events of a run."),
-    "merge": ("datagen.commands.merge:merge", "Merge runs into one."),
-    "verify": ("datagen.commands.verify:verify", "Check a run; repair, replay or clean it."),
-    "relabel": ("datagen.commands.relabel:relabel", "Label a heuristic run by other parameters."),
-    "calibrate": ("datagen.commands.calibrate:calibrate", "Fit the heuristic's parameters to trial labels."),
-    "audit": ("datagen.commands.audit:audit", "Show the cost of labels by stage, and of 180,000."),
-    "report": ("datagen.commands.report:report", "Write one HTML page about runs and models."),
-    "show": ("datagen.commands.show:show", "Draw a picture of one scene of a run."),
-    "train": ("datagen.commands.train:train_model", "Train a model on labels."),
-    "evaluate": ("datagen.commands.evaluate:evaluate", "Compare models with baselines and the paper."),
-    "closed-loop": (
-        "datagen.commands.closed_loop:closed_loop",
-        "Execute methods' picks with arrival errors.",
-    ),
-    "benchmark": ("datagen.commands.benchmark:app", "Make and score the frozen benchmark."),
-    "predict": ("datagen.commands.predict:predict", "Find a base pose in a depth camera's frame."),
-    "doctor": ("datagen.doctor:doctor", "Check this machine, and show how to fix what is missing."),
-    "assets": ("datagen.assets.cli:app", "List, fetch, lock, verify and split houses and objects."),
+# Headings of --help, each with its verbs: where a verb is defined, and its line. A verb returns an exit code,
+# or None for 0. If it is also a Python function, it returns its result, and `prints` names the function that
+# prints it.
+_HEADINGS: dict[str, dict[str, tuple[str, str]]] = {
+    "Make labels": {
+        "submit": ("datagen.commands.submit:submit", "Make labels: start a run, or resume it."),
+        "resume": ("datagen.commands.resume:resume", "Make the missing labels of a run; extend it."),
+        "cancel": ("datagen.commands.cancel:cancel", "Ask the jobs of a run to stop; wait until they have."),
+        "merge": ("datagen.commands.merge:merge", "Merge runs into one."),
+        "relabel": ("datagen.commands.relabel:relabel", "Label a heuristic run by other parameters."),
+    },
+    "Look at runs": {
+        "status": ("datagen.commands.status:status", "Show progress, failures and events of a run."),
+        "show": ("datagen.commands.show:show", "Draw a picture of one scene of a run."),
+        "audit": ("datagen.commands.audit:audit", "Show the cost of labels by stage, and of 180,000."),
+        "report": ("datagen.commands.report:report", "Write one HTML page about runs and models."),
+    },
+    "Check runs": {
+        "verify": ("datagen.commands.verify:verify", "Check a run; repair, replay or clean it."),
+    },
+    "Models": {
+        "train": ("datagen.commands.train:train_model", "Train a model on labels."),
+        "evaluate": ("datagen.commands.evaluate:evaluate", "Compare models with baselines and the paper."),
+        "closed-loop": (
+            "datagen.commands.closed_loop:closed_loop",
+            "Execute methods' picks with arrival errors.",
+        ),
+        "calibrate": (
+            "datagen.commands.calibrate:calibrate",
+            "Fit the heuristic's parameters to trial labels.",
+        ),
+        "benchmark": ("datagen.commands.benchmark:app", "Make and score the frozen benchmark."),
+        "predict": ("datagen.commands.predict:predict", "Find a base pose in a depth camera's frame."),
+    },
+    "This machine": {
+        "assets": ("datagen.assets.cli:app", "List, fetch, lock, verify and split houses and objects."),
+        "doctor": ("datagen.doctor:doctor", "Check this machine, and show how to fix what is missing."),
+    },
 }
-
-_HEADINGS = {
-    "Make labels": ("submit", "resume", "cancel", "merge", "relabel"),
-    "Look at runs": ("status", "show", "audit", "report"),
-    "Check and keep runs": ("verify",),
-    "Models": ("train", "evaluate", "benchmark", "closed-loop", "predict", "calibrate"),
-    "This machine": ("doctor", "assets"),
-}
+VERBS = {verb: defined for verbs in _HEADINGS.values() for verb, defined in verbs.items()}
 
 # The extra to name for a verb where several extras contain the missing library.
-_EXTRA_OF: dict[str, str] = dict.fromkeys(
-    ("train", "evaluate", "benchmark", "closed-loop", "predict", "calibrate"), "train"
-)
+_EXTRA_OF: dict[str, str] = dict.fromkeys(_HEADINGS["Models"], "train")
 
 
 def build_app(called: str = "") -> App:

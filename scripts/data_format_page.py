@@ -29,7 +29,7 @@ RUN/
   ledger/<attempt>.json          how it ended: outcome, cause, stack, cost
   quarantine/<shard>.json        a quarantined shard: seeds, causes, stacks
   quarantine/<shard>.lifted-<k>.json  a former quarantine record of a shard that was tried again
-  jobs/<job>.json                a driver; .state.json is its state, .stop.json a stop request
+  jobs/<job>.json                a driver; .state.json is its state, .stop a stop request
   index/<digest>.json.gz         summaries of settled records: a cache, may be removed
   lineage.json                   of a merged run: the runs that made its shards
   data.zarr/                     after sealing: one flat Zarr v3 store over all committed shards

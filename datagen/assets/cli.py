@@ -80,8 +80,8 @@ def lock(
     """Write the sha256, size, licence and source of every file to assets.lock.json.
 
     Args:
-        licence: Licence of all files [unchanged].
-        source: Origin of all files [unchanged].
+        licence: Licence of all files. [default: unchanged]
+        source: Origin of all files. [default: unchanged]
     """
     written = locks.lock(folder, licence, source)
     total = sum(entry.size for entry in written.files)

@@ -177,11 +177,6 @@ def _peak_memory_bytes() -> int:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
-def resident_bytes() -> int:
-    """Resident memory of this process (bytes)."""
-    return psutil.Process().memory_info().rss
-
-
 def short_line(text: str) -> str:
     """The text as one short line."""
     line = " ".join(text.split())

@@ -141,8 +141,8 @@ class JobRecorder:
     def pass_on_request(self, stop: StopRequest) -> None:
         """Make the request of another process, if any; one that a signal has made before counts once."""
         with suppress(InputError):
-            if (order := self._jobs.stop_order(self._state.id)) is not None:
-                while not (stop.force if order.now else stop.drain):
+            if (asked := self._jobs.stop_of(self._state.id)) is not None:
+                while not (stop.force if asked == "now" else stop.drain):
                     stop.ask()
 
     def seal(self) -> None:

@@ -20,7 +20,6 @@ from datagen.cluster.attempt_guard import (
     collect_post_mortem,
     failure_report,
     guarded,
-    resident_bytes,
 )
 from datagen.cluster.protocol import AttemptReport, AttemptResult, Task
 from datagen.cluster.ray_cluster import RaySettings, first_line, ray_cluster
@@ -89,15 +88,12 @@ class RayExecutor(Generic[T]):
         restart: Callable[[], Any] | None = None,
     ) -> None:
         self._settings, self._restart = settings, restart
-        limit_bytes, attempts = settings.resident_limit_bytes, settings.attempts_per_worker
 
         def work(task: T) -> AttemptReport:
-            report = guarded(function, task)
-            if resident_bytes() > limit_bytes:
-                retire_worker()
-            return report
+            return guarded(function, task)
 
         self._function: Callable[[T], AttemptReport] = work
+        attempts = settings.attempts_per_worker
         self._options: dict[str, Any] = {"num_cpus": 1, "max_retries": 0, "max_calls": attempts}
         self._tasks: dict[Any, T] = {}  # by the reference to the result
         self._refs: dict[str, Any] = {}  # by attempt
@@ -281,17 +277,3 @@ def _report_of(death: _Death[Any], left: PostMortem) -> AttemptReport:
     if outcome == "crashed" and left.note is None and death.task.notes:
         outcome, cause = "lost", "its worker died before it began or after it ended, or with its machine"
     return failure_report(death.task, outcome, cause, left)
-
-
-def retire_worker() -> None:
-    """Make this Ray worker process exit after its current task.
-
-    Ray ends a worker when its count of executions reaches `max_calls`; there is no public way to request it,
-    so the count is set to the last before the end.
-    """
-    import ray
-
-    manager = ray._private.worker.global_worker.function_actor_manager  # pyright: ignore
-    for function_id, info in manager._function_execution_info.items():  # pyright: ignore
-        if info.max_calls:
-            manager._num_task_executions[function_id] = info.max_calls - 1  # pyright: ignore

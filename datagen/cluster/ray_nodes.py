@@ -28,7 +28,8 @@ class OwnNode:
     """
 
     def __init__(self, ray: Any, address: str) -> None:
-        self._node = ray._private.worker._global_node  # None for a client (ray://), which needs none of them
+        # Private: the raylet's socket has no public name. None for a client (ray://), which needs neither.
+        self._node = ray._private.worker._global_node
         self._patience_s = 0.0 if address == "local" else _PATIENCE_S
         self._responded_s = self._looked_s = time.monotonic()
 

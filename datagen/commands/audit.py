@@ -38,7 +38,7 @@ def audit(
     Args:
         runs: Runs of one or several label sources.
         candidates: Candidates whose outcomes and agreement are counted; grid: all.
-        prices: TOML file with prices [list prices, docs/guides/costs.md].
+        prices: TOML file with prices. [default: list prices, docs/guides/costs.md]
         map: Picture to write, FILE.svg or FILE.png: where on the floor labels are wrong.
     """
     if not runs:

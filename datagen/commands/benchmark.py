@@ -56,8 +56,8 @@ def make(
         houses: procthor:DIR with the benchmark's houses.
         objects: ycb:DIR with the benchmark's objects; OUT/objects gets their training and test parts.
         out: Folder for the runs.
-        run: Run to make; repeat for more [all].
-        benchmark: Definition of another benchmark [the shipped one].
+        run: Run to make; repeat for more. [default: all]
+        benchmark: Definition of another benchmark. [default: the shipped one]
     """
     from datagen.benchmark.definition import read_benchmark
     from datagen.benchmark.frozen_runs import refuse_differing
@@ -135,12 +135,12 @@ def score(
     Args:
         methods: Methods to compare.
         runs: Folder with the runs of `datagen benchmark make`.
-        run: Run to score on; repeat for more [all].
+        run: Run to score on; repeat for more. [default: all]
         fit: Run in validation houses to fit baselines on; repeat for more.
-        benchmark: Definition of another benchmark [the shipped one].
+        benchmark: Definition of another benchmark. [default: the shipped one]
         bootstrap: Resamples of scenes for each interval.
         seed: Seed of the resamples and of baselines.
-        threads: CPU threads of the models [chosen by torch].
+        threads: CPU threads of the models. [default: chosen by torch]
         out: File to write, .json or .html; repeat for both.
         json: Print one JSON document, and progress as JSON lines.
     """

@@ -67,9 +67,9 @@ def evaluate(
 
     Args:
         paths: Checkpoints of `datagen train`, or `released`, and runs of sim or plan labels.
-        candidates: Candidate set to report; repeat for more [all in the runs].
+        candidates: Candidate set to report; repeat for more. [default: all in the runs]
         fit: Run in validation houses to fit baselines on; repeat for more.
-        baselines: Baseline to compare with, or none; repeat for more [all].
+        baselines: Baseline to compare with, or none; repeat for more. [default: all]
         detector: Folder of a zero-shot object detector, for the detector baseline.
         heuristic: Parameters of the analytic baseline, from `datagen calibrate`.
         arrival: Arrival error to report too: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv.
@@ -79,7 +79,7 @@ def evaluate(
         allow_seen_houses: Report training houses separately instead of failing.
         allow_incomplete: Accept runs that lack planned samples instead of failing.
         allow_mixed_labels: Accept labels of one source in different versions instead of failing.
-        threads: CPU threads of the models [chosen by torch].
+        threads: CPU threads of the models. [default: chosen by torch]
         html: HTML page to write, with tables, curves and example grids.
         json: Report progress as JSON lines.
 

@@ -85,7 +85,7 @@ class PredictOptions:
 
     Args:
         checkpoint: Checkpoint of `datagen train`; in Python also a scorer of `datagen.load_scorer`
-            [the released model].
+            [default: the released model]
         base_height: Height of the arm's mount above the floor (m); only --demo has a default.
         reach: Reach of the arm from its mount (m); only --demo has a default.
         demo: Predict on the frame that ships with the package; writes demo.png and demo.html.
@@ -93,8 +93,9 @@ class PredictOptions:
         click: Pixel u,v on the target in the first frame, where it has no mask.
         camera_height: Height of the frame's camera (m), where it has no pose.
         gravity: Direction of gravity x,y,z in the camera frame (x right, y down).
-        robot_camera_height: Height of the robot's own camera (m) [that of the frame's camera].
-        footprint: Base: radius (m), corners x,y;x,y;... around the mount, x ahead, or a robot [as trained].
+        robot_camera_height: Height of the robot's own camera (m). [default: that of the frame's camera]
+        footprint: Base: radius (m), corners x,y;x,y;... around the mount, x ahead, or a robot.
+            [default: as trained]
         depth_scale: Metres per step of 16-bit depth.
         allow_unseen: Also consider cells of which the floor, or the way there, was not seen.
         arrival: Arrival error to choose for: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv.

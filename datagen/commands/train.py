@@ -83,18 +83,18 @@ class TrainOptions:
         stage: Heuristic labels, then sim labels, or sim labels alone.
         runs: Runs to train on; merged and sealed ones too.
         out: Checkpoint to write; the same command resumes it.
-        val: Runs for validation [a tenth of the houses is held out].
+        val: Runs for validation. [default: a tenth of the houses is held out]
         init: Checkpoint to continue from, of stage 1 or another training, or released (stage2).
-        model: Architecture [shared, or that of --init].
+        model: Architecture. [default: shared, or that of --init]
         model_config: Sizes of the model: a TOML file, or field=value; repeat for more.
-        epochs: Epochs [12 in stage1, else 20].
+        epochs: Epochs. [default: 12 in stage1, else 20]
         house_share: Share of the houses to train on, for learning curves.
-        lr: Highest learning rate [0.002; 0.001 in stage2].
+        lr: Highest learning rate. [default: 0.002; 0.001 in stage2]
         seed: Seed of weights, order and dropout.
         augment: noise, holes, dropout, colour, rotation, comma-separated; or a TOML file.
         encoded: Folder for encoded inputs of `shared`: written once, read by later trainings.
         device: Device of the model.
-        threads: Threads [all cores].
+        threads: Threads. [default: all cores]
         allow_incomplete: Accept runs that lack planned samples instead of failing.
         json: Report progress as JSON lines.
     """

@@ -54,7 +54,7 @@ def job_report(job: StoredJob) -> dict[str, Any]:
         **record.model_dump(mode="json", exclude={"format_version"}),
         "health": job.health(),
         "heard_s": round(job.silence().total_seconds(), 1),
-        "asked_to_stop": None if job.order is None else ("now" if job.order.now else "drain"),
+        "asked_to_stop": job.stop,
         "state": fields,
     }
 
@@ -76,7 +76,7 @@ def health_line(job: StoredJob) -> str:
     doing = "sealing" if state.phase == "sealing" else f"{state.labels_per_s:,.1f} labels/s, {left} left"
     if state.stopping:
         doing = f"stopping, {state.in_flight} running"
-    elif job.order is not None:
+    elif job.stop is not None:
         doing += ", asked to stop"
     silent = "silent, " if health == "silent" else ""
     return f"{silent}{state.done} of {counted(state.shards, 'shard')}, {doing}, {heard} ({where})"

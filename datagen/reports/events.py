@@ -40,16 +40,12 @@ def events_of(storage: Storage) -> list[Event]:
 def _job_events(storage: Storage) -> list[Event]:
     events: list[Event] = []
     for job in Jobs(storage).all():
-        record, state, order = job.record, job.state, job.order
+        record, state = job.record, job.state
         where = f"on {record.host}, process {record.pid}"
         if record.submission:
             where += f", submitted to Ray as {record.submission}"
         text = f"job {job.id} began {where}: {' '.join(record.command)}"
         events.append(Event(record.started, "job_began", text))
-        if order is not None:
-            how = "at once" if order.now else "after the running attempts"
-            text = f"job {job.id} is asked to stop {how}, from {order.host}"
-            events.append(Event(order.asked, "stop_asked", text))
         if state is not None and state.end:
             why = f": {state.cause}" if state.cause else ""
             text = (

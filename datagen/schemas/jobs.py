@@ -1,7 +1,7 @@
 """Records of the jobs of a run: their drivers, progress, and stop requests.
 
 `jobs/<id>.json` identifies the driver; `jobs/<id>.state.json` is replaced while the job runs, last with its
-end; `jobs/<id>.stop.json` asks it to stop. Data depends only on commits, not on these records.
+end; `jobs/<id>.stop` asks it to stop. Data depends only on commits, not on these records.
 """
 
 from __future__ import annotations
@@ -9,28 +9,27 @@ from __future__ import annotations
 import platform
 import re
 import secrets
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal
 
 import psutil
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, read_record, utc_now
+from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record, read_record
 from datagen.schemas.run_records import FORMAT_VERSION, StoredRecord
 from datagen.schemas.storage import Storage
 
 JobId = Annotated[str, Field(pattern=r"^[0-9]{8}T[0-9]{6}-[0-9a-f]{8}$")]
 JobEnd = Literal["", "complete", "interrupted", "failed", "aborted", "broken"]
+Stop = Literal["now", "drain"]
 Health = Literal["ended", "live", "silent", "dead"]
 SILENT_AFTER = timedelta(minutes=1)
 # A process that began after the job's record was written only reuses its number.
 _PID_SLACK_S = 5.0
 _JOB_FILE = re.compile(r"jobs/([0-9]{8}T[0-9]{6}-[0-9a-f]{8})\.json")
-
-
-Replaced = TypeVar("Replaced", bound=BaseModel)
 
 
 class JobRecord(StoredRecord):
@@ -68,23 +67,13 @@ class JobState(StoredRecord):
     cause: str = ""
 
 
-class StopRecord(StoredRecord):
-    """jobs/<id>.stop.json: a request to stop the job."""
-
-    format_version: int = FORMAT_VERSION
-    id: JobId
-    now: bool  # kill the running attempts
-    asked: str
-    host: str
-
-
 @dataclass(frozen=True)
 class StoredJob:
     """All records of one job."""
 
     record: JobRecord
     state: JobState | None  # None between its first two writes
-    order: StopRecord | None
+    stop: Stop | None = None  # whether it was asked to stop: at once, or after the running attempts
 
     @property
     def id(self) -> str:
@@ -121,13 +110,13 @@ class Jobs:
 
     def ask_to_stop(self, job: str, at_once: bool) -> None:
         """Ask a job to stop. A request to stop at once is not replaced by a weaker one."""
-        existing = self.stop_order(job)
-        if existing is None or (at_once and not existing.now):
-            order = StopRecord(id=job, now=at_once, asked=utc_now(), host=platform.node())
-            self._storage.put(f"jobs/{job}.stop.json", encode_record(order))
+        if self.stop_of(job) != "now":
+            self._storage.put(f"jobs/{job}.stop", b"now" if at_once else b"drain")
 
-    def stop_order(self, job: str) -> StopRecord | None:
-        return self._read_or_none(f"jobs/{job}.stop.json", StopRecord)
+    def stop_of(self, job: str) -> Stop | None:
+        """The request to stop a job; None for none."""
+        data = self._storage.get(f"jobs/{job}.stop", MAX_RECORD_BYTES)
+        return "now" if data == b"now" else "drain" if data == b"drain" else None
 
     def get(self, job: str) -> StoredJob | None:
         """Read one job; None where it does not exist. InputError where its record is damaged."""
@@ -141,23 +130,17 @@ class Jobs:
             return None
         if record.id != job:
             raise InputError(where, "id", f"is {record.id}, not {job}", "Remove this foreign file")
-        return StoredJob(record, self._read_or_none(f"jobs/{job}.state.json", JobState), self.stop_order(job))
+        # Replaced too often for fsync: after a power cut a state may be torn, and then counts as absent.
+        state = None
+        with suppress(InputError):
+            state = read_record(self._storage, f"jobs/{job}.state.json", JobState)
+        return StoredJob(record, state, self.stop_of(job))
 
     def all(self) -> list[StoredJob]:
         names = (_JOB_FILE.fullmatch(file.key) for file in self._storage.list("jobs"))
         found = [job for name in names if name and (job := self.get(name[1])) is not None]
         # Names have seconds only, and two jobs may begin within one.
         return sorted(found, key=lambda job: (job.record.started, job.record.id))
-
-    def _read_or_none(self, key: str, model: type[Replaced]) -> Replaced | None:
-        # Replaced too often for fsync: after a power cut it may be torn, and then counts as absent.
-        data = self._storage.get(key, MAX_RECORD_BYTES)
-        if data is None:
-            return None
-        try:
-            return decode_record(key, data, model)
-        except InputError:
-            return None
 
 
 def new_job_id() -> str:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -18,19 +18,18 @@ from datagen.cluster.job_monitor import JobMonitor, JobProgress, JobRecorder
 from datagen.cluster.protocol import AttemptReport, JobSummary, JobTotals, StopRequest
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.display.progress import Progress
-from datagen.schemas.jobs import Jobs, JobState, StopRecord
+from datagen.schemas.jobs import Jobs, JobState, Stop
 from datagen.schemas.storage import open_storage
 from tests.cluster.simulated import FakeClock, PaperRecorder, SimulatedExecutor
 
 SHARD_S = 5.0
-Request = Literal["drain", "force"]
 CRASH = AttemptReport("a", 5, "crashed", cause="Fatal Python error: Segmentation fault")
 
 
 class WatchedJobs(Jobs):
     """Real records, and when they were written and read; the stop request is a function of the time."""
 
-    def __init__(self, folder: Path, clock: FakeClock, requested: Callable[[float], Request | None]) -> None:
+    def __init__(self, folder: Path, clock: FakeClock, requested: Callable[[float], Stop | None]) -> None:
         super().__init__(open_storage(folder))
         self.clock, self.requested = clock, requested
         self.states: list[tuple[float, JobState]] = []
@@ -40,10 +39,9 @@ class WatchedJobs(Jobs):
         super().put_state(state)
         self.states.append((self.clock.now_s, state))
 
-    def stop_order(self, job: str) -> StopRecord | None:
+    def stop_of(self, job: str) -> Stop | None:
         self.looked_s.append(self.clock.now_s)
-        mode = self.requested(self.clock.now_s)
-        return StopRecord(id=job, now=mode == "force", asked="", host="") if mode else None
+        return self.requested(self.clock.now_s)
 
 
 @dataclass
@@ -61,7 +59,7 @@ class Watched:
 
 
 def watch(
-    folder: Path, requested: Callable[[float], Request | None] = lambda now_s: None, asked: int = 0
+    folder: Path, requested: Callable[[float], Stop | None] = lambda now_s: None, asked: int = 0
 ) -> Watched:
     clock, out, stop = FakeClock(), io.StringIO(), StopRequest()
     for _ in range(asked):
@@ -101,8 +99,8 @@ def test_a_request_drains_the_job_and_is_published_at_once(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("drains_first", [False, True])
 def test_a_request_to_stop_at_once_kills_attempts_in_flight(tmp_path: Path, drains_first: bool) -> None:
-    def requested(now_s: float) -> Request | None:
-        return "force" if now_s >= 33 else "drain" if drains_first and now_s >= 30 else None
+    def requested(now_s: float) -> Stop | None:
+        return "now" if now_s >= 33 else "drain" if drains_first and now_s >= 30 else None
 
     job = watch(tmp_path, requested)
     assert job.summary.end == "interrupted" and job.closed["cancelled"] > 0

@@ -71,7 +71,10 @@ def token_of(process: psutil.Process) -> str:
         return ""
 
 
-def test_the_cluster_of_this_machine_is_asked_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_is_the_cluster_that_ray_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    with pytest.raises(InputError, match="RAY_ADDRESS names no cluster"):
+        refuse_unusable("auto")
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     with pytest.raises(InputError, match=r"127\.0\.0\.1:1: cannot be reached"):
         refuse_unusable("auto")

@@ -68,7 +68,7 @@ def test_a_job_is_seen_stopped_and_told_of_from_elsewhere(
     capsys.readouterr()
     assert cli.run(["status", str(run), "--log", "--json"]) == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [e["event"] for e in events] == ["job_began", "stop_asked", "job_ended"]
+    assert [e["event"] for e in events] == ["job_began", "job_ended"]
     assert cli.run(["cancel", str(run)]) == 0
     assert "none is running" in capsys.readouterr().out
 
@@ -79,9 +79,7 @@ def test_at_once_ends_a_shard_in_the_middle_of_it_or_after(tmp_path: Path) -> No
     assert cli.run(["cancel", str(tmp_path / "run"), "--now"]) == 0
     assert work.process.wait(800) == 130
     job = work.job()
-    assert (
-        job.order is not None and job.order.now and job.state is not None and job.state.end == "interrupted"
-    )
+    assert job.stop == "now" and job.state is not None and job.state.end == "interrupted"
 
 
 def test_a_job_that_was_killed_is_dead_and_nobody_waits_for_it(
@@ -142,7 +140,7 @@ def test_a_job_elsewhere_that_is_silent_is_asked_and_not_waited_for(
     Jobs(place).begin(record)
     assert cli.run(["cancel", str(tmp_path / "run")]) == 1
     assert "silent, last sign 3 h 0 min ago" in capsys.readouterr().out
-    assert Jobs(place).stop_order(record.id) is not None
+    assert Jobs(place).stop_of(record.id) == "drain"
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -77,8 +77,6 @@ def misbehave(word: str) -> None:
         hand_over_bad_rows(word)
     elif word == "disk":
         raise JobCannotContinue(f"RUN: {os.strerror(errno.ENOSPC)}. Free disk space")
-    elif word == "grow":
-        GROWN.append(bytearray(os.urandom(1) * (300 << 20)))
 
 
 def hand_over_bad_rows(word: str) -> None:

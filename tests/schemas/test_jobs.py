@@ -67,11 +67,10 @@ def test_a_process_that_only_has_the_number_is_not_the_job(tmp_path: Path) -> No
 
 def test_a_request_to_end_at_once_is_not_taken_back_by_a_gentler_one(tmp_path: Path) -> None:
     jobs, job = Jobs(open_storage(tmp_path)), new_job_id()
-    assert jobs.stop_order(job) is None
-    for at_once, now in ((False, False), (True, True), (False, True)):
+    assert jobs.stop_of(job) is None
+    for at_once, expected in ((False, "drain"), (True, "now"), (False, "now")):
         jobs.ask_to_stop(job, at_once)
-        order = jobs.stop_order(job)
-        assert order is not None and order.now is now
+        assert jobs.stop_of(job) == expected
 
 
 def test_a_torn_state_is_as_if_it_were_absent_and_a_damaged_record_is_named(tmp_path: Path) -> None:
@@ -79,9 +78,9 @@ def test_a_torn_state_is_as_if_it_were_absent_and_a_damaged_record_is_named(tmp_
     record = record_of(datetime.now(UTC), os.getpid())
     jobs.begin(record)
     (tmp_path / f"jobs/{record.id}.state.json").write_bytes(b"")
-    (tmp_path / f"jobs/{record.id}.stop.json").write_text('{"now": true}')
+    (tmp_path / f"jobs/{record.id}.stop").write_bytes(b"")
     (job,) = jobs.all()
-    assert job.state is None and job.order is None and job.record == record
+    assert job.state is None and job.stop is None and job.record == record
     with pytest.raises(InputError, match="exists already"):
         jobs.begin(record.model_copy(update={"pid": 3}))
     file = tmp_path / f"jobs/{record.id}.json"

@@ -9,9 +9,8 @@ import pytest
 from datagen import cli
 from datagen.console.printing import print_lines, print_rows
 from datagen.evaluation_report.page import escape
-from datagen.schemas.jobs import JobRecord, Jobs, JobState, StopRecord
+from datagen.schemas.jobs import JobRecord, Jobs, JobState
 from datagen.schemas.lineage import LINEAGE, ShardOrigin, encode_lineage
-from datagen.schemas.record_files import encode_record
 from datagen.schemas.run_records import LedgerEntry, QuarantineRecord
 from tests.made_runs import make_run
 
@@ -51,8 +50,7 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
             JobState(id=job, updated=AT, phase="making", end=end, cause=EVIL, stopping=EVIL)
         )  # fmt: skip
         if not end:
-            order = StopRecord(id=job, now=False, asked=AT, host=EVIL)
-            run.storage.put(f"jobs/{job}.stop.json", encode_record(order))
+            jobs.ask_to_stop(job, at_once=False)
     origin = ShardOrigin(address=f"/runs/{EVIL}", created=AT, platform=EVIL, code_version=EVIL)
     run.storage.put(LINEAGE, encode_lineage({origin: [0, 2, 4]}))
     return Path(run.storage.url)
