@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from benchmarks.repeatability import stored_scenes
-from datagen.drawing.film import Film, Lens, filmstrip_moments
+from datagen.drawing.film import Film, filmstrip_moments
 from datagen.drawing.posed_robot import robot_bodies
 from datagen.schemas.cost import StageClock
 from datagen.schemas.outcomes import OUTCOMES
@@ -29,7 +29,7 @@ from datagen.workers.scenes import SettledScene
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
 from datagen.workers.world import open_world
 
-_VIEW_PX, _TEXT_PX, _COLOURS = (120, 90), 12, 48
+_VIEW_PX, _TEXT_PX, _COLOURS = (120, 72), 12, 48
 _COLUMNS = 2  # of trials
 
 
@@ -83,16 +83,16 @@ def strip(
     recording = trial.results[0].recording
     assert recording is not None
     bodies = robot_bodies(at.robot, spec.candidates.base_radius_m)
-    shown = filmstrip_moments(recording)
-    film = Film(cast(Any, scene), bodies, trial.T_world_base[0], recording, shown, _VIEW_PX, _VIEW_PX)
+    film = Film(cast(Any, scene), bodies, trial.T_world_base[0], recording, filmstrip_moments(recording))
     phase, last = np.array(recording.phase), len(recording.phase) - 1
     grasp, closed = (int(np.flatnonzero(phase == name)[-1]) for name in ("approach", "close"))
-    lens = Lens(film.shots[1], 2, outlined=False)
+    near = film.views[1]
     (w, h), moments = _VIEW_PX, (grasp, closed, (closed + last) // 2, last)
     image = Image.new("RGB", (w * len(moments), h + _TEXT_PX + 3), "#ffffff")
     ImageDraw.Draw(image).text((2, 1), words, "#141414")
     for k, moment in enumerate(moments):
-        image.paste(Image.fromarray(lens.picture(film.stage(moment))), (k * w, _TEXT_PX + 3))
+        view = near.picture(film.stage(moment), 1).resize(_VIEW_PX)
+        image.paste(view, (k * w, _TEXT_PX + 3))
     return image
 
 

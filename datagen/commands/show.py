@@ -8,7 +8,6 @@ from pathlib import Path
 from datagen.configuration.specify import refuse_missing_packages
 from datagen.console.options import AS_FOUND, AssetSources, RunPath, Whole, refuse_output
 from datagen.console.printing import print_rows
-from datagen.drawing.arm_picture import draw_arm_picture
 from datagen.drawing.scene_picture import Shown, draw_scene_picture
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import find_scene, open_runs
@@ -22,11 +21,10 @@ _BEST = "best"
 def show(
     run: RunPath, /, *, out: Path, scene: Whole = 0, trial: str | None = None, given: AssetSources = AS_FOUND
 ) -> int:
-    """Draw a picture of one scene: the RGB-D frame, floor plans with the candidates, and numbers.
+    """Draw a picture of one scene: the RGB frame, floor plans with the candidates, and numbers.
 
-    For heuristic labels it shows depth and point cloud; for plan and sim labels, outcomes, scores and the
-    successful grasps. With --trial, a candidate's trial is run again and drawn as a filmstrip, or animated
-    in a .gif. Scenes are rendered again from the stored poses.
+    With --trial, a candidate's trial is run again and drawn as a filmstrip, or animated in a .gif. Scenes are
+    rendered again from the stored poses.
 
     For example: datagen show runs/first --scene 3 --out scene.png
 
@@ -36,27 +34,26 @@ def show(
         trial: Show the trial of a candidate: its index, or best (plan, sim).
     """
     refuse_output(out, "--out", ".png", ".gif")
-    moving = out.suffix.lower() == ".gif"
+    is_trial = trial is not None or out.suffix.lower() == ".gif"
     candidate = _candidate(trial)
-    opened, of_run = find_scene(open_runs(run), scene)
+    opened, found = find_scene(open_runs(run), scene)
     spec, sources = opened.manifest.spec, opened.manifest.sources
-    of_trial = trial is not None or moving
-    if of_trial and spec.arm is None:
+    if is_trial and spec.arm is None:
         problem = f"{spec.label_source} labels have no trials"
         fix = "Name a run of plan or sim labels, or give only --out FILE.png"
         raise InputError(run, "--trial" if trial is not None else "--out", problem, fix)
     refuse_missing_packages(spec.label_source)
-    rows = read_scene(opened, of_run)
+    rows = read_scene(opened, found)
     houses = given.houses or sources.get("houses", "builtin")
     world = open_world(spec, houses, given.objects or sources.get("objects", "builtin"))
     shown = Shown(run, spec, rows, reconstruct_scene(world, rows.record))
-    if of_trial:
+    if is_trial:
         # Imported here, so that scenes are drawn without the libraries for planning and trials.
         from datagen.drawing.trial_picture import draw_trial
 
         lines = draw_trial(shown, candidate, out)
     else:
-        lines = (draw_scene_picture if spec.arm is None else draw_arm_picture)(shown, out)
+        lines = draw_scene_picture(shown, out)
     print_rows(f"scene {scene} of {run}", [("target", shown.target), *lines, ("picture", str(out))])
     return 0
 

@@ -1,9 +1,9 @@
-"""The room from above with candidates by label, outcome or score, marks, and the legend."""
+"""The room from above, with the candidates by label or outcome, or by score."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch, Polygon, Rectangle
+from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.path import Path
-from matplotlib.patheffects import withStroke
 
 from datagen.display.styles import (
-    BEST,
     CAMERA,
     CLUTTER,
     LABEL_STYLES,
@@ -34,20 +32,21 @@ from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 _HEAD_ROOM_M = 1.9  # higher parts, such as the wall over a door, are not drawn
 _KIND_EDGE = {"wall": "#303030", "furniture": "#6b5b4a", "small": "#8a6fb0"}
-_DOT_PT2 = 26
-_SMALL_PT2 = {"out_of_reach": 9, "base_collision": 13}  # frequent outcomes of little interest
-_REACH_COLOUR, _REACH_DASHES = "#1b3a6b", ((5, 3), (1, 1.5), (7, 2, 1, 2), (3, 1))
-_LEGEND_CHARACTERS = 40
+_DOT_PT2, _SMALL_PT2 = 26, 11  # small: frequent outcomes of little interest
+_OF_LITTLE_INTEREST = ("out_of_reach", "base_collision")
+_LEGEND_CHARACTERS = 42
 
 Handle = Line2D | Patch
 
 
-def draw_plan(axes: Axes, recalled: ReconstructedScene, half_m: float, faded: bool = False) -> list[Style]:
-    """Draw house, placed objects and camera, `half_m` to each side of the target; returns the drawn styles.
+def draw_plan(axes: Axes, recalled: ReconstructedScene, base_xy_m: F64) -> list[Handle]:
+    """Draw house, placed objects and camera around the target, pale; return the legend.
 
-    `faded` makes the plan pale, so that candidates stand out.
+    The plan shows the camera and all base poses (N, 2).
     """
     x, y = (float(v) for v in recalled.target_center_m[:2])
+    shown_m = np.concatenate([base_xy_m, recalled.camera.T_world_camera[None, :2, 3]])
+    half_m = max(1.1, float(np.abs(shown_m - (x, y)).max()) + 0.2)
     for room in recalled.house.house.rooms:
         axes.add_patch(Polygon(room.polygon_m, closed=True, facecolor="#f4efe6", edgecolor="#c9bfae", lw=0.5))
     solid = [b for b in recalled.house.house.bodies if _height_m(b) > 0.01]
@@ -55,130 +54,87 @@ def draw_plan(axes: Axes, recalled: ReconstructedScene, half_m: float, faded: bo
         parts = [p for p in body.convex_parts_m if p[:, 2].min() < _HEAD_ROOM_M]
         outlines = [convex_hull(p[:, :2].astype(np.float64)) for p in parts]
         if outlines:
-            colour = "#454545" if body.kind == "wall" else _mean_colour(body)
+            colour = "#454545" if body.kind == "wall" else tuple(body.visual.face_rgb.mean(axis=0) / 255)
             edge = _KIND_EDGE[body.kind]
-            axes.add_collection(PolyCollection(outlines, facecolors=colour, edgecolors=edge, linewidths=0.4))
-    for k, outline in enumerate(object_outlines(recalled)):
-        style = CLUTTER if k else TARGET
-        axes.add_patch(
-            Polygon(outline, closed=True, facecolor=style.colour, edgecolor=style.edge, lw=0.5, zorder=5)
-        )
-    if faded:
-        axes.add_patch(
-            Rectangle((0, 0), 1, 1, transform=axes.transAxes, color="white", alpha=0.55, lw=0, zorder=4)
-        )
+            axes.add_collection(
+                PolyCollection(outlines, facecolors=[colour], edgecolors=edge, linewidths=0.4)
+            )
+    pale: dict[str, Any] = {"transform": axes.transAxes, "color": "white", "alpha": 0.5, "lw": 0, "zorder": 4}
+    axes.add_patch(Rectangle((0, 0), 1, 1, **pale))
+    for k, (model, T) in enumerate(zip(recalled.models, recalled.T_world_object, strict=True)):
+        points = np.concatenate(model.convex_parts_m).astype(np.float64)
+        outline, style = convex_hull((points @ T[:3, :3].T + T[:3, 3])[:, :2]), CLUTTER if k else TARGET
+        axes.add_patch(Polygon(outline, fc=style.colour, ec=style.edge, lw=0.5, zorder=5))
     _draw_camera(axes, recalled)
     axes.set(xlim=(x - half_m, x + half_m), ylim=(y - half_m, y + half_m), xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal")
-    is_near = bool((np.abs(recalled.camera.T_world_camera[:2, 3] - (x, y)) < half_m).all())
-    return [*([CAMERA] if is_near else []), TARGET, *([CLUTTER] if len(recalled.models) > 1 else [])]
+    marks = [CAMERA, TARGET, *([CLUTTER] if len(recalled.models) > 1 else [])]
+    return [handle(style, style.words) for style in marks]
 
 
-def half_width_m(recalled: ReconstructedScene) -> float:
-    """Half the side (m) of a plan that shows the camera and the usual range of candidates."""
-    gap = np.abs(recalled.camera.T_world_camera[:2, 3] - recalled.target_center_m[:2]).max()
-    return max(1.35, float(gap) + 0.3)
+def draw_candidates(axes: Axes, samples: Mapping[str, Any]) -> list[Handle]:
+    """Draw candidates by outcome, or by label without outcomes; hollow where the base collides.
 
-
-def object_outlines(recalled: ReconstructedScene) -> list[F64]:
-    """Outlines (K, 2) of the placed objects seen from above, world; the first is the target."""
-    outlines = []
-    for model, T in zip(recalled.models, recalled.T_world_object, strict=True):
-        points = np.concatenate(model.convex_parts_m).astype(np.float64)
-        outlines.append(convex_hull((points @ T[:3, :3].T + T[:3, 3])[:, :2]))
-    return outlines
-
-
-def draw_labels(axes: Axes, base_xy_m: F64, label: Any, clear: Any) -> list[Handle]:
-    """Draw candidates (N, 2) by label, filled where the base fits, hollow elsewhere; returns the legend."""
+    Returns the legend with the number of each kind.
+    """
+    xy, clear = np.asarray(samples["base_xy_m"], np.float64), np.asarray(samples["base_is_clear"], np.bool_)
+    if "outcome" in samples:
+        kinds = [(OUTCOME_STYLES[name], code, f"{name}: ") for code, name in enumerate(OUTCOMES)]
+        values = np.asarray(samples["outcome"])
+    else:
+        kinds = [(style, label, "") for label, style in LABEL_STYLES.items()]
+        values = np.asarray(samples["label"])
     legend: list[Handle] = []
-    for value, style in LABEL_STYLES.items():
-        for fits, words in ((True, "base fits"), (False, "base collides")):
-            rows = (label == value) & (clear == fits)
-            if rows.any():
-                _draw_dots(axes, base_xy_m[rows], style, fits, _DOT_PT2)
-                text = f"{int(rows.sum())} {style.words}, {words}"
-                legend.append(_handle(style, text, filled=fits))
-    return legend
-
-
-def draw_outcomes(axes: Axes, base_xy_m: F64, outcome: Any, clear: Any) -> list[Handle]:
-    """Draw candidates (N, 2) by outcome code (N,), hollow where the base collides; returns the legend."""
-    legend: list[Handle] = []
-    for code, name in enumerate(OUTCOMES):
-        style, count = OUTCOME_STYLES[name], int((outcome == code).sum())
+    for style, value, name in kinds:
+        size_pt2 = _SMALL_PT2 if name.removesuffix(": ") in _OF_LITTLE_INTEREST else _DOT_PT2
         for fits in (True, False):
-            rows = (outcome == code) & (clear == fits)
-            _draw_dots(axes, base_xy_m[rows], style, fits, _SMALL_PT2.get(name, _DOT_PT2))
-        if count:
-            filled = bool((clear & (outcome == code)).any())
-            legend.append(_handle(style, f"{count} {name}: {style.words}", filled))
+            rows = (values == value) & (clear == fits)
+            if not rows.any():
+                continue
+            face = style.colour if fits else "none"
+            look: dict[str, Any] = {"facecolors": face, "edgecolors": style.colour, "lw": 1, "zorder": 8}
+            axes.scatter(*xy[rows].T, s=size_pt2, marker=_marker(style), **look)
+            words = "" if name else ", base fits" if fits else ", base collides"
+            legend.append(handle(style, f"{int(rows.sum())} {name}{style.words}{words}", fits))
     return legend
 
 
 def draw_scores(axes: Axes, base_xy_m: F64, score: Any, threshold: float) -> ScalarMappable:
     """Draw candidates by score, the threshold in the middle of the colours; returns the scale."""
     norm = Normalize(0, 2 * threshold or 1)
-    return axes.scatter(
-        *base_xy_m.T, c=score, cmap=SCORE_COLOURS, norm=norm, s=24, zorder=8, edgecolors="#444444", lw=0.4
-    )
+    look: dict[str, Any] = {"s": 24, "zorder": 8, "edgecolors": "#444444", "lw": 0.4}
+    return axes.scatter(*base_xy_m.T, c=score, cmap=SCORE_COLOURS, norm=norm, **look)
 
 
-def draw_pick(axes: Axes, base_xy_m: F64, style: Style) -> None:
-    """Draw a chosen candidate (2,)."""
-    axes.scatter(
-        *base_xy_m, marker=_plain(style), s=190, color=style.colour, edgecolors=style.edge, lw=1,
-        zorder=9,
-    )  # fmt: skip
+def draw_pick(axes: Axes, base_xy_m: F64, style: Style) -> Handle:
+    """Draw a chosen candidate (2,); returns its line of the legend."""
+    look: dict[str, Any] = {"color": style.colour, "edgecolors": style.edge, "lw": 1, "zorder": 9}
+    axes.scatter(*base_xy_m, marker=_marker(style), s=190, **look)
+    return handle(style, style.words)
 
 
-def draw_reach(axes: Axes, target_xy_m: F64, radii_m: Sequence[tuple[str, float]]) -> list[Handle]:
-    """Draw a circle around the target for each (robot, reach); returns the legend."""
-    x, y = (float(v) for v in target_xy_m)
-    legend: list[Handle] = []
-    for k, (name, radius_m) in enumerate(radii_m):
-        look: dict[str, Any] = {"ls": (0, _REACH_DASHES[k % 4]), "lw": 1.4}
-        halo = [withStroke(linewidth=3, foreground="white")]
-        axes.add_patch(
-            Circle((x, y), radius_m, fill=False, edgecolor=_REACH_COLOUR, zorder=7, path_effects=halo, **look)
-        )
-        angle = np.radians(90 - 40 * k)
-        axes.annotate(
-            name, (x + radius_m * np.cos(angle), y + radius_m * np.sin(angle)), (0, 3),
-            textcoords="offset points", color=_REACH_COLOUR, fontsize=9, ha="center", zorder=10,
-            path_effects=halo, annotation_clip=True,
-        )  # fmt: skip
-        legend.append(
-            Line2D(
-                [],
-                [],
-                color=_REACH_COLOUR,
-                label=f"{name} reaches the target from within {radius_m:.2f} m",
-                **look,
-            )
-        )
-    return legend
-
-
-def draw_legend(axes: Axes, handles: Sequence[Handle], title: str, marks: Sequence[Style]) -> None:
-    """Draw a legend that fills a panel: these handles, and the marks."""
+def draw_legend(axes: Axes, handles: Sequence[Handle]) -> None:
+    """Draw a legend that fills a panel."""
     axes.set_axis_off()
-    handles = [*handles, *(_handle(style, style.words) for style in marks)]
-    for handle in handles:
-        handle.set_label(textwrap.fill(str(handle.get_label()), _LEGEND_CHARACTERS))
-    axes.legend(
-        handles=handles, title=title, alignment="left", loc="upper left", frameon=False, fontsize=10,
-        borderaxespad=0, labelspacing=0.55, handlelength=2.2,
-    )  # fmt: skip
+    for entry in handles:
+        entry.set_label(textwrap.fill(str(entry.get_label()), _LEGEND_CHARACTERS))
+    look: dict[str, Any] = {"frameon": False, "borderaxespad": 0, "labelspacing": 0.5, "handlelength": 2}
+    axes.legend(handles=handles, loc="upper left", fontsize=10, **look)
+
+
+def handle(style: Style, text: str, is_filled: bool = True) -> Handle:
+    """A line of a legend."""
+    if not style.marker:
+        return Patch(fc=style.colour, ec=style.edge, lw=0.8, label=text)
+    face = style.colour if is_filled else "none"
+    return Line2D([], [], ls="", ms=9, marker=_marker(style), mfc=face, mec=style.edge, label=text)
 
 
 def _draw_camera(axes: Axes, recalled: ReconstructedScene) -> None:
     """The observation camera and its horizontal field of view."""
     camera = recalled.camera
-    eye = camera.T_world_camera[:2, 3]
-    half = np.arctan(camera.width_px / 2 / camera.fx_px)
-    forward = camera.T_world_camera[:2, 2]
-    heading = float(np.arctan2(forward[1], forward[0]))
+    eye, ahead = camera.T_world_camera[:2, 3], camera.T_world_camera[:2, 2]
+    half, heading = np.arctan(camera.width_px / 2 / camera.fx_px), float(np.arctan2(ahead[1], ahead[0]))
     rays = eye + 0.6 * np.array([[np.cos(heading + s), np.sin(heading + s)] for s in (half, -half)])
     axes.add_patch(Polygon([eye, *rays], closed=True, facecolor=CAMERA.colour, alpha=0.12, lw=0, zorder=6))
     c, s = np.cos(heading), np.sin(heading)
@@ -186,30 +142,10 @@ def _draw_camera(axes: Axes, recalled: ReconstructedScene) -> None:
     axes.scatter(*eye, marker=marker, s=190, color=CAMERA.colour, edgecolors=CAMERA.edge, lw=0.8, zorder=7)
 
 
-def _draw_dots(axes: Axes, xy_m: F64, style: Style, filled: bool, size_pt2: float) -> None:
-    face = style.colour if filled else "none"
-    axes.scatter(
-        *xy_m.T, s=size_pt2, marker=_plain(style), facecolors=face, edgecolors=style.colour, lw=1, zorder=8
-    )
-
-
-def _handle(style: Style, text: str, filled: bool = True) -> Handle:
-    if not style.marker:
-        return Patch(fc=style.colour, ec=style.edge, lw=0.8, label=text)
-    face = style.colour if filled else "none"
-    size = 13 if style is BEST else 8 if isinstance(style.marker, str) else 12
-    return Line2D([], [], ls="", ms=size, marker=_plain(style), mfc=face, mec=style.edge, label=text)
-
-
-def _plain(style: Style) -> str | Path:
+def _marker(style: Style) -> str | Path:
     """The marker as matplotlib accepts it."""
     return style.marker if isinstance(style.marker, str) else Path(np.array(style.marker))
 
 
 def _height_m(body: StaticBody) -> float:
     return max((float(p[:, 2].max()) for p in body.convex_parts_m), default=0.0)
-
-
-def _mean_colour(body: StaticBody) -> tuple[float, float, float]:
-    r, g, b = body.visual.face_rgb.mean(axis=0) / 255
-    return (float(r), float(g), float(b))

@@ -28,48 +28,40 @@ class RobotBodies:
 
     def poses(self, T_world_base: F64, q_rad: F64, opening_m: float) -> F64:
         """Poses (B, 4, 4) in the world for joints (A,) and the opening between the pads (m)."""
-        T_base_link = self.robot.T_base_link(q_rad)
+        T_base_link = np.concatenate([self.robot.T_base_link(q_rad), np.eye(4)[None]])
         T_base_tcp = self.robot.T_base_tcp(q_rad)
-        out = np.empty((len(self.rays), 4, 4))
-        for k, (link, side) in enumerate(zip(self.link, self.finger_side, strict=True)):
-            T = np.eye(4) if link < 0 else T_base_link[link]
-            if side:
-                # Links are posed with the hand fully open; fingers slide along y of the TCP.
-                slide_m = float(side) * (opening_m - self.robot.gripper.max_opening_m) / 2
-                T = T_base_tcp @ translation(0.0, slide_m, 0.0) @ inverse(T_base_tcp) @ T
-            out[k] = T_world_base @ T
+        out = T_world_base @ T_base_link[self.link]
+        for k in self.hand:
+            # Links are posed with the hand fully open; fingers slide along y of the TCP.
+            slide_m = float(self.finger_side[k]) * (opening_m - self.robot.gripper.max_opening_m) / 2
+            slide = T_base_tcp @ translation(0.0, slide_m, 0.0) @ inverse(T_base_tcp)
+            out[k] = T_world_base @ slide @ T_base_link[self.link[k]]
         return out
 
     @property
-    def hand(self) -> tuple[int, ...]:
+    def hand(self) -> list[int]:
         """Rows of the finger bodies."""
-        return tuple(int(k) for k in np.flatnonzero(self.finger_side))
+        return np.flatnonzero(self.finger_side).tolist()
 
 
 def robot_bodies(robot: Robot, pedestal_radius_m: float) -> RobotBodies:
     """The robot's bodies, with a pedestal for robots without a base of their own."""
     sides = dict(zip(robot.link_names[-2:], (1, -1), strict=True))
-    meshes, links, fingers = [], [], []
-    for k, (name, mesh) in enumerate(zip(robot.link_names, robot.link_meshes(), strict=True)):
-        if len(mesh.faces):
-            meshes.append(_coloured(mesh, _FINGER_RGB) if name in sides else mesh)
-            links.append(k)
-            fingers.append(sides.get(name, 0))
+    bodies = [
+        (_coloured(mesh) if name in sides else mesh, k, sides.get(name, 0))
+        for k, (name, mesh) in enumerate(zip(robot.link_names, robot.link_meshes(), strict=True))
+        if len(mesh.faces)
+    ]
     if robot.base_radius_m is None:
         r, height_m = (pedestal_radius_m, pedestal_radius_m), robot.base_height_m
         column = frustum((-height_m, 0.0), r, r, _PEDESTAL_RGB, _PEDESTAL_SIDES)
-        meshes.append(join([column])[0])
-        links.append(-1)
-        fingers.append(0)
+        bodies.append((join([column])[0], -1, 0))
+    meshes, links, fingers = zip(*bodies, strict=True)
     radii_m = np.array([float(np.linalg.norm(m.vertices_m, axis=1).max()) for m in meshes])
-    return RobotBodies(
-        robot,
-        tuple(ray_mesh(m) for m in meshes),
-        radii_m,
-        np.array(links, np.int32),
-        np.array(fingers, np.int32),
-    )
+    rays = tuple(ray_mesh(mesh) for mesh in meshes)
+    return RobotBodies(robot, rays, radii_m, np.array(links, np.int32), np.array(fingers, np.int32))
 
 
-def _coloured(mesh: Mesh, rgb: tuple[int, int, int]) -> Mesh:
-    return Mesh(mesh.vertices_m, mesh.faces, np.tile(np.array(rgb, np.uint8), (len(mesh.faces), 1)))
+def _coloured(mesh: Mesh) -> Mesh:
+    rgb = np.tile(np.array(_FINGER_RGB, np.uint8), (len(mesh.faces), 1))
+    return Mesh(mesh.vertices_m, mesh.faces, rgb)

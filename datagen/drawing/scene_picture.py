@@ -1,4 +1,4 @@
-"""A stored scene to draw, and its picture for heuristic labels: frame, depth, floor plans, cloud, numbers."""
+"""A stored scene to draw, and its picture: frame, floor plans by label or outcome and by score, numbers."""
 
 from __future__ import annotations
 
@@ -9,22 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from mpl_toolkits.mplot3d import Axes3D
 
 from datagen.display.figures import draw_frame, new_sheet, save_sheet, write_facts
-from datagen.display.styles import BEST_BY_SCORE, TARGET
-from datagen.drawing.floor_plan import (
-    draw_labels,
-    draw_legend,
-    draw_pick,
-    draw_plan,
-    draw_scores,
-    half_width_m,
-)
+from datagen.display.styles import BEST, BEST_BY_SCORE
+from datagen.drawing.floor_plan import draw_candidates, draw_legend, draw_pick, draw_plan, draw_scores
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.identity import Stream, generator
-from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.outcomes import OUTCOMES, REDRAW_CAUSES
 from datagen.schemas.specification import Specification
 from datagen.workers.rendering import Frame
 from datagen.workers.scenes.generate import render_frame
@@ -32,6 +23,8 @@ from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 Columns = Mapping[str, Any]
 Lines = list[tuple[str, str]]  # printed next to a picture
+
+_MOST_ROBOTS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +45,11 @@ class Shown:
     def title(self) -> str:
         return f"Scene {self.recalled.index} of {self.run}: {self.target}"
 
+    @property
+    def target(self) -> str:
+        record = self.rows.record
+        return f"{self.recalled.models[0].name} on {record['support_type']}, {record['room_type']}"
+
     @cached_property
     def frame(self) -> Frame:
         """The RGB-D frame, rendered again."""
@@ -63,125 +61,80 @@ class Shown:
         x, y = self.samples["base_xy_m"][row]
         return f"({x:.3f}, {y:.3f}) m"
 
-    @property
-    def target(self) -> str:
-        record = self.rows.record
-        return f"{self.recalled.models[0].name} on {record['support_type']}, {record['room_type']}"
-
 
 def draw_scene_picture(shown: Shown, out: Path) -> Lines:
-    """Write the picture of a scene; return its positives and its best base."""
-    recalled, record, samples = shown.recalled, shown.rows.record, shown.samples
-    tau = shown.spec.heuristic.tau
-    figure = new_sheet(shown.title, 8.0)
-    upper, lower = np.asarray(figure.subfigures(2, 1, height_ratios=(6.4, 1.6))).tolist()
-    panels = upper.subplots(2, 3, width_ratios=(1.1, 1, 1))
-    draw_frame(panels[0, 0], shown.frame.rgb, shown.frame.body == 1)
-    _draw_depth(upper, panels[1, 0], shown.frame)
-
-    xy = np.asarray(samples["base_xy_m"], np.float64)
-    marks = draw_plan(panels[0, 1], recalled, half_width_m(recalled))
-    draw_plan(panels[0, 2], recalled, half_width_m(recalled))
-    score, clear = np.asarray(samples["heuristic_score"]), np.asarray(samples["base_is_clear"])
-    legend = draw_labels(panels[0, 1], xy, np.asarray(samples["label"]), clear)
-    panels[0, 1].set_title("candidates by label")
-    scale = draw_scores(panels[0, 2], xy, score, tau)
-    panels[0, 2].set_title("candidates by score H")
-    upper.colorbar(scale, ax=panels[0, 1:].tolist(), shrink=0.75, label=f"H (good from {tau:.2g} on)")
-    best = best_clear(score, clear)
-    if best is not None:
-        draw_pick(panels[0, 2], xy[best], BEST_BY_SCORE)
-
-    panels[1, 1].remove()
-    _draw_cloud(upper.add_subplot(2, 3, 5, projection="3d"), record)
-    draw_legend(panels[1, 2], legend, "base poses", marks if best is None else [BEST_BY_SCORE, *marks])
-    columns = lower.subplots(1, 2)
-    write_facts(columns[0], _scene(shown))
-    write_facts(columns[1], _candidates(samples))
+    """Write the picture of a scene; return its positives and its best base poses."""
+    samples, tau = shown.samples, shown.spec.heuristic.tau
+    xy, score = np.asarray(samples["base_xy_m"], np.float64), np.asarray(samples["heuristic_score"])
+    figure = new_sheet(shown.title, 6.6)
+    upper, lower = np.asarray(figure.subfigures(2, 1, height_ratios=(3.7, 2.9))).tolist()
+    frame_ax, label_ax, score_ax = upper.subplots(1, 3, width_ratios=(1.05, 1, 1))
+    draw_frame(frame_ax, shown.frame.rgb, shown.frame.body == 1)
+    marks = draw_plan(label_ax, shown.recalled, xy)
+    draw_plan(score_ax, shown.recalled, xy)
+    legend = draw_candidates(label_ax, samples)
+    scale = draw_scores(score_ax, xy, score, tau)
+    upper.colorbar(scale, ax=[label_ax, score_ax], shrink=0.8, label=f"H (good from {tau:.2g} on)")
+    picks = [(row, style) for row, style in _picks(samples).values() if row is not None]
+    for row, style in picks:
+        draw_pick(label_ax, xy[row], style)
+        legend.append(draw_pick(score_ax, xy[row], style))
+    label_ax.set_title("candidates by outcome" if "outcome" in samples else "candidates by label")
+    score_ax.set_title("candidates by score H")
+    facts_ax, legend_ax = lower.subplots(1, 2, width_ratios=(1.15, 1))
+    positive = f"{int(samples['label'].sum())} of {len(samples['label'])} candidates"
+    best = [(head, _described(shown, row)) for head, (row, _) in _picks(samples).items()]
+    write_facts(facts_ax, [*_facts(shown), ("positive", positive), *best], 15)
+    draw_legend(legend_ax, [*legend, *marks])
     save_sheet(figure, out)
-    words = "none is clear" if best is None else f"{shown.position_text(best)}, H = {score[best]:.3f}"
-    return [positives(samples), ("best clear base", words)]
+    return [("positive", positive), *best]
 
 
-def positives(samples: Columns) -> tuple[str, str]:
-    """The number of positive candidates, as (heading, text)."""
-    return "positive", f"{int(samples['label'].sum())} of {len(samples['label'])} candidates"
+def best_success(samples: Columns) -> int | None:
+    """Row of the best success, or None: most lifts, then fewest grasps, then the widest clearance."""
+    rows = np.flatnonzero(samples["outcome"] == tuple(OUTCOMES).index("success"))
+    if not len(rows):
+        return None
+    keys = [-samples["path_clearance_m"][rows]]
+    if "attempts" in samples:
+        share = samples["successes"][rows] / np.maximum(samples["trials"][rows], 1)
+        keys += [samples["attempts"][rows], -share]
+    return int(rows[np.lexsort(keys)[0]])
 
 
-def best_clear(score: Any, clear: Any) -> int | None:
-    """Row of the highest score among clear candidates, or None when none is clear."""
-    rows = np.flatnonzero(clear)
-    return int(rows[np.argmax(score[rows])]) if len(rows) else None
+def _picks(samples: Columns) -> dict[str, tuple[int | None, Any]]:
+    """The clear candidate of the highest score and, of an arm's labels, the best success."""
+    clear = np.flatnonzero(samples["base_is_clear"])
+    highest = int(clear[np.argmax(np.asarray(samples["heuristic_score"])[clear])]) if len(clear) else None
+    picks: dict[str, tuple[int | None, Any]] = {"highest H": (highest, BEST_BY_SCORE)}
+    return picks | ({"best success": (best_success(samples), BEST)} if "outcome" in samples else {})
 
 
-def scene_facts(shown: Shown) -> Lines:
-    """House, room, support and objects of a scene."""
-    record, models = shown.rows.record, shown.recalled.models
+def _described(shown: Shown, row: int | None) -> str:
+    if row is None:
+        return "none"
+    samples = shown.samples
+    text = f"candidate {row} at {shown.position_text(row)}, H {samples['heuristic_score'][row]:.2f}"
+    return f"{text}: {tuple(OUTCOMES)[samples['outcome'][row]]}" if "outcome" in samples else text
+
+
+def _facts(shown: Shown) -> Lines:
+    """House, objects, settling and robots of a scene."""
+    record, models, samples = shown.rows.record, shown.recalled.models, shown.samples
     height_m = float(np.asarray(record["T_world_support"])[2, 3])
-    return [
-        ("house", str(record["house_id"])),
-        ("room", f"{record['room_type']} ({record['room_id']})"),
-        ("support", f"{record['support_type']}, {height_m:.3f} m high"),
-        ("target", f"{models[0].name}, {1000 * models[0].mass_kg:.0f} g"),
-        ("clutter", ", ".join(m.name for m in models[1:]) or "none"),
-    ]
-
-
-def _draw_depth(figure: Any, axes: Axes, frame: Frame) -> None:
-    depth = np.where(frame.depth_m > 0, frame.depth_m, np.nan)
-    image = axes.imshow(depth, cmap="magma_r")
-    axes.set_title("depth")
-    axes.set_axis_off()
-    figure.colorbar(image, ax=axes, location="bottom", shrink=0.8, aspect=30, pad=0.03, label="depth [m]")
-
-
-def _draw_cloud(axes: Axes3D, record: Columns) -> None:
-    n = int(record["n_points"])
-    points = np.asarray(record["points_m"][:n], np.float64)
-    colours = np.asarray(record["rgb"][:n], np.float64) / 255
-    mask = np.asarray(record["target_mask"][:n])
-    axes.scatter(*points[~mask].T, c=colours[~mask], s=2, lw=0, depthshade=False)
-    axes.scatter(*points[mask].T, c=TARGET.colour, s=2, lw=0, depthshade=False)
-    low, high = points.min(axis=0), points.max(axis=0)
-    axes.set_box_aspect(1.15 * (high - low))
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
-    axes.locator_params(nbins=4)
-    camera = np.asarray(record["T_world_camera"])[:3, 3] - np.asarray(record["target_center_m"])
-    axes.view_init(elev=30, azim=float(np.degrees(np.arctan2(camera[1], camera[0]))))
-    axes.set_title(f"cloud around the target, {n:,} points")
-
-
-def _scene(shown: Shown) -> Lines:
-    record = shown.rows.record
-    counts = zip(REDRAW_CAUSES, np.asarray(record["redraws"]), strict=True)
-    speed_mm, depth_mm = (1000 * float(record[k]) for k in ("residual_speed_mps", "penetration_m"))
-    steps, seen = int(record["settle_steps"]), float(record["target_visible_fraction"])
-    return [
-        *scene_facts(shown),
-        ("settled", f"{steps} steps, then {speed_mm:.2f} mm/s, penetration {depth_mm:.2f} mm"),
-        ("resampled", ", ".join(f"{cause} {n}" for cause, n in counts if n) or "never"),
-        ("frame", f"{100 * seen:.0f}% of the target visible"),
-    ]
-
-
-def _candidates(samples: Columns) -> Lines:
-    rho, label = np.asarray(samples["visibility"]), np.asarray(samples["label"])
-    clear = np.asarray(samples["base_is_clear"])
-    low, high = 100 * (rho < 0.04).mean(), 100 * (rho > 0.8).mean()
-    good = f"{int(label.sum())} ({100 * label.mean():.0f}%), {int((label * clear).sum())} where the base fits"
+    rejected = zip(REDRAW_CAUSES, np.asarray(record["redraws"]), strict=True)
     robots, rows = np.unique(np.asarray(samples["robot_index"]), return_index=True)
+    sizes = [
+        f"reach {samples['arm_reach_m'][row]:.2f} m, mount {samples['base_height_m'][row]:.2f} m high"
+        for row in rows[:_MOST_ROBOTS]
+    ]
+    more = [f"and {len(robots) - _MOST_ROBOTS} more"] if len(robots) > _MOST_ROBOTS else []
     return [
-        ("candidates", f"{len(label)}, {int(clear.sum())} where the base fits"),
-        ("good", good),
-        ("visibility", f"< 0.04: {low:.0f}%, 0.04 to 0.8: {100 - low - high:.0f}%, > 0.8: {high:.0f}%"),
-        *(
-            (
-                f"robot {robot}",
-                f"camera {samples['camera_height_m'][row]:.2f} m, "
-                f"mount {samples['base_height_m'][row]:.2f} m, reach {samples['arm_reach_m'][row]:.2f} m",
-            )
-            for robot, row in zip(robots[:5], rows[:5], strict=True)
-        ),
-        *([("", f"and {len(robots) - 5} more robots")] if len(robots) > 5 else []),
+        ("house", f"{record['house_id']}, {record['room_type']}"),
+        ("support", f"{record['support_type']}, {height_m:.2f} m high"),
+        ("target", f"{models[0].name}, {100 * float(record['target_visible_fraction']):.0f}% visible"),
+        ("clutter", ", ".join(m.name for m in models[1:]) or "none"),
+        ("settled", f"in {int(record['settle_steps'])} steps"),
+        ("rejected tries", ", ".join(f"{cause} {n}" for cause, n in rejected if n) or "none"),
+        *((f"robot {k}" if k < _MOST_ROBOTS else "", text) for k, text in enumerate([*sizes, *more])),
     ]

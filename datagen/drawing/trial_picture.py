@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
 from datagen.display.styles import OUTCOME_STYLES
-from datagen.drawing.arm_picture import best_success
-from datagen.drawing.film import Film, Moments, filmstrip_moments
-from datagen.drawing.filmstrip import (
-    MOTION_NEAR_PX,
-    MOTION_WIDE_PX,
-    SHEET_NEAR_PX,
-    SHEET_WIDE_PX,
-    Title,
-    write_motion,
-    write_sheet,
-)
+from datagen.drawing.film import Film, filmstrip_moments, write_animation, write_sheet
 from datagen.drawing.posed_robot import robot_bodies
-from datagen.drawing.scene_picture import Lines, Shown
+from datagen.drawing.scene_picture import Lines, Shown, best_success
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.outcomes import OUTCOMES
@@ -28,15 +18,8 @@ from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
-from datagen.workers.labels.arm_labelling import (
-    ArmInScene,
-    CandidateTrial,
-    arm_in_scene,
-    arm_of,
-    try_candidate,
-)
+from datagen.workers.labels.arm_labelling import CandidateTrial, arm_in_scene, try_candidate
 from datagen.workers.motion import MotionPlan
-from datagen.workers.motion.arm_collision import surroundings
 from datagen.workers.motion.rrt_connect import dense
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes import SettledScene
@@ -45,7 +28,17 @@ from datagen.workers.trials import Recording, TrialResult
 
 _STEP_S = 0.05  # between the moments of a plan that was not executed
 _STEP_RAD = 0.08  # advance of a plan in that time, over all joints
-_TRIES = 7  # poses to show of an arm without a plan
+
+
+@dataclass(frozen=True, eq=False)
+class Retrial:
+    """The repeated trial of a candidate. `recording` holds an execution, a plan, or the tucked arm."""
+
+    robot: Robot
+    T_world_base: F64  # (4, 4), true pose of the mount
+    trial: CandidateTrial
+    result: TrialResult | None  # the execution to show
+    recording: Recording
 
 
 def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
@@ -53,93 +46,46 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
 
     Raises InputError where there is no such candidate, no success, or no motion to animate.
     """
-    arm = arm_of(shown.spec)
     row = _candidate(shown, candidate)
-    retrial = try_again(
-        shown.recalled, reconstruct_candidates(shown.samples, shown.recalled), row, shown.spec
-    )
-    outcome, robot = retrial.trial.outcome, retrial.robot
+    candidates = reconstruct_candidates(shown.samples, shown.recalled)
+    again = try_again(shown.recalled, candidates, row, shown.spec)
+    outcome, robot = again.trial.outcome, again.robot
+    bodies = robot_bodies(robot, float(shown.spec.candidates.radius_of_base_m(robot.reach_m)))
+    moments = filmstrip_moments(again.recording)
+    film = Film(shown.recalled, bodies, again.T_world_base, again.recording, moments)
     moving = out.suffix.lower() == ".gif"
-    if moving and not retrial.moves:
+    if moving and not film.moves:
         problem = f"candidate {row} ended as {outcome} before the arm moved: there is nothing to animate"
         raise InputError(out, "--out", problem, "Give a name that ends in .png")
+    words = OUTCOME_STYLES[outcome].words
+    if outcome == "success":
+        words = "a whole plan" if again.result is None else "lifted and held"
     stored = tuple(OUTCOMES)[int(shown.samples["outcome"][row])]
-    title = Title(
-        OUTCOME_STYLES[outcome].colour,
-        f"candidate {row}: {outcome} ({_words(retrial)})",
-        (
-            shown.title,
-            f"{arm.robot}, reach {robot.reach_m:.2f} m, mount {robot.base_height_m:.2f} m high"
-            f"   {_measured(retrial)}" + (f"   stored as {stored}" if stored != outcome else ""),
-        ),
-    )
-    sizes = (MOTION_WIDE_PX, MOTION_NEAR_PX) if moving else (SHEET_WIDE_PX, SHEET_NEAR_PX)
-    bodies = robot_bodies(robot, float(shown.spec.candidates.radius_of_base_m(robot.reach_m)))
-    film = Film(shown.recalled, bodies, retrial.T_world_base, retrial.recording, retrial.moments, *sizes)
-    (write_motion if moving else write_sheet)(film, title, out)
-    return [
-        ("candidate", f"{row} at {shown.position_text(row)}"),
-        ("outcome", outcome),
-        ("measured", _measured(retrial)),
-    ]
+    facts = f"{robot.name}, reach {robot.reach_m:.2f} m, mount {robot.base_height_m:.2f} m high"
+    changed = f"   stored as {stored}" if stored != outcome else ""
+    title = (f"candidate {row}: {outcome} ({words})", shown.title, facts, _measured(again) + changed)
+    (write_animation if moving else write_sheet)(film, OUTCOME_STYLES[outcome].colour, title, out)
+    where = f"{row} at {shown.position_text(row)}"
+    return [("candidate", where), ("outcome", outcome), ("measured", _measured(again))]
 
 
 def _candidate(shown: Shown, candidate: int | None) -> int:
-    samples, scene = shown.samples, shown.recalled.index
-    count = len(samples["label"])
-    if candidate is None:
-        best = best_success(samples)
-        if best is None:
-            problem = f"no candidate of scene {scene} succeeded"
-            raise InputError(
-                shown.run, "--trial", problem, f"Give one from 0 to {count - 1} to see why it failed"
-            )
+    scene, last = shown.recalled.index, len(shown.samples["label"]) - 1
+    if candidate is None and (best := best_success(shown.samples)) is not None:
         return best
-    if not 0 <= candidate < count:
+    if candidate is None or not 0 <= candidate <= last:
         problem = f"{candidate} is not a candidate of scene {scene}"
-        raise InputError(shown.run, "--trial", problem, f"Give one from 0 to {count - 1}")
+        problem = f"no candidate of scene {scene} succeeded" if candidate is None else problem
+        raise InputError(shown.run, "--trial", problem, f"Give one from 0 to {last} to see why it failed")
     return candidate
 
 
-def _words(retrial: Retrial) -> str:
-    if retrial.trial.outcome != "success":
-        return OUTCOME_STYLES[retrial.trial.outcome].words
-    return "a whole plan" if retrial.result is None else "lifted and held"
-
-
-def _measured(retrial: Retrial) -> str:
-    trial, result = retrial.trial, retrial.result
+def _measured(again: Retrial) -> str:
+    result = again.result
     if result is None:
-        return "planned, not executed" if trial.plan is not None else "no plan, nothing executed"
-    numbers = (
-        f"lift {100 * result.lift_m:.1f} cm, slip {100 * result.slip_m:.1f} cm, "
-        f"others moved {100 * result.disturbed_m:.1f} cm"
-    )
-    if retrial.shown is None or len(trial.results) == 1:
-        return numbers
-    return f"{numbers}, execution {retrial.shown + 1} of {len(trial.results)}"
-
-
-@dataclass(frozen=True, eq=False)
-class Retrial:
-    """The repeated trial of a candidate. `recording` holds a trial, a plan, or tried poses."""
-
-    robot: Robot
-    T_world_base: F64  # (4, 4), true pose of the mount
-    trial: CandidateTrial
-    shown: int | None  # recorded row of `trial.results`; None where nothing was executed
-    recording: Recording
-    moments: Moments  # to show
-
-    @property
-    def moves(self) -> bool:
-        """Whether the recording is a motion; else it holds poses that were tried."""
-        return bool(self.recording.time_s[-1] > self.recording.time_s[0])
-
-    @property
-    def result(self) -> TrialResult | None:
-        """The execution to show."""
-        return None if self.shown is None else self.trial.results[self.shown]
+        return "planned, not executed" if again.trial.plan is not None else "no plan, nothing executed"
+    lift_cm, slip_cm, others_cm = (100 * v for v in (result.lift_m, result.slip_m, result.disturbed_m))
+    return f"lift {lift_cm:.1f} cm, slip {slip_cm:.1f} cm, others moved {others_cm:.1f} cm"
 
 
 def try_again(scene: SettledScene, candidates: SceneCandidates, row: int, spec: Specification) -> Retrial:
@@ -147,28 +93,24 @@ def try_again(scene: SettledScene, candidates: SceneCandidates, row: int, spec: 
     at = arm_in_scene(scene, candidates, row, spec, StageClock())
     trial = try_candidate(at, candidates, row, spec, record=True)
     T_world_base = at.base_pose(candidates, row)
-    alike = [k for k, result in enumerate(trial.results) if result.outcome == trial.outcome]
-    shown = alike[0] if alike else None
-    recording = None if shown is None else trial.results[shown].recording
-    if shown is not None and recording is not None:
-        T_world_base = trial.T_world_base[shown]
-        kept = _finite_part(recording)
-        return Retrial(at.robot, T_world_base, trial, shown, kept, filmstrip_moments(kept))
+    for result, T_executed in zip(trial.results, trial.T_world_base, strict=True):
+        if result.outcome == trial.outcome and result.recording is not None:
+            return Retrial(at.robot, T_executed, trial, result, _finite_part(result.recording))
     if trial.plan is not None:
         planned = planned_motion(at.robot, trial.plan, T_world_base, scene.T_world_object)
-        return Retrial(at.robot, T_world_base, trial, None, planned, filmstrip_moments(planned))
-    poses, moments = _tried_poses(at, trial, T_world_base)
-    return Retrial(at.robot, T_world_base, trial, None, poses, moments)
+        return Retrial(at.robot, T_world_base, trial, None, planned)
+    opening_m = np.array([at.robot.gripper.max_opening_m])
+    tucked = Recording(
+        np.zeros(1), at.robot.homes_rad[:1], opening_m, scene.T_world_object[None], ("tucked",)
+    )
+    return Retrial(at.robot, T_world_base, trial, None, tucked)
 
 
 def planned_motion(robot: Robot, plan: MotionPlan, T_world_base: F64, T_world_object: F64) -> Recording:
     """A plan as if executed perfectly: the target moves with the hand once it is grasped."""
     q, phases = [plan.q_reach_rad[:1]], ["reach"]
-    for phase, path in (
-        ("reach", plan.q_reach_rad),
-        ("approach", plan.q_approach_rad),
-        ("lift", plan.q_lift_rad),
-    ):
+    paths = {"reach": plan.q_reach_rad, "approach": plan.q_approach_rad, "lift": plan.q_lift_rad}
+    for phase, path in paths.items():
         q.append(dense(path, _STEP_RAD)[1:])
         phases += [phase] * len(q[-1])
     q_rad = np.concatenate(q)
@@ -178,47 +120,12 @@ def planned_motion(robot: Robot, plan: MotionPlan, T_world_base: F64, T_world_ob
         if phase == "lift":
             poses[k, 0] = T_world_base @ robot.T_base_tcp(q_rad[k]) @ T_tcp_target
     opening_m = np.full(len(q_rad), plan.opening_m)
-    return Recording(
-        np.arange(len(q_rad), dtype=np.float64) * _STEP_S, q_rad, opening_m, poses, tuple(phases)
-    )
-
-
-def _tried_poses(at: ArmInScene, trial: CandidateTrial, T_world_base: F64) -> tuple[Recording, Moments]:
-    """The tucked arm and, where planning failed later, the arm at grasps with an IK solution."""
-    robot = at.robot
-    q_rad, opening_m, words = [robot.homes_rad[0]], [robot.gripper.max_opening_m], ["tucked"]
-    if trial.report is not None:
-        planning = at.planning
-        around = surroundings(planning, T_world_base)
-        kept = planning.around.kept
-        T_base_tcp = np.matmul(inverse(T_world_base), planning.around.T_world_tcp[kept])
-        table = planning.moving.table
-        distance, seeds = table.distance(T_base_tcp), table.seeds(T_base_tcp, planning.params.ik_seeds)
-        for k in np.argsort(distance, kind="stable").tolist():
-            found = (robot.ik(T_base_tcp[k], seed) for seed in seeds[k])
-            q = next((q for q in found if q is not None), None)
-            if q is None:
-                continue
-            blocked = around.is_base_stuck or around.first_arm_blocked(q[None], is_target_held=False) == 0
-            q_rad.append(q)
-            opening_m.append(float(planning.around.opening_m[kept[k]]))
-            words.append("the arm collides here" if blocked else "the arm is free here")
-            if len(words) > _TRIES:
-                break
-    n = len(words)
-    poses = np.tile(at.scene.T_world_object, (n, 1, 1, 1))
-    recording = Recording(np.zeros(n), np.stack(q_rad), np.array(opening_m), poses, ("reach",) * n)
-    return recording, tuple(enumerate(words))
+    time_s = np.arange(len(q_rad), dtype=np.float64) * _STEP_S
+    return Recording(time_s, q_rad, opening_m, poses, tuple(phases))
 
 
 def _finite_part(recording: Recording) -> Recording:
     """The part of the recording with finite numbers; unstable physics cannot be drawn."""
     finite = np.isfinite(recording.q_rad).all(1) & np.isfinite(recording.T_world_object).all((1, 2, 3))
     n = int(np.argmin(np.append(finite, False)))
-    return Recording(
-        recording.time_s[:n],
-        recording.q_rad[:n],
-        recording.opening_m[:n],
-        recording.T_world_object[:n],
-        recording.phase[:n],
-    )
+    return Recording(*(getattr(recording, field.name)[:n] for field in fields(recording)))

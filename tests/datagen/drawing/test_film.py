@@ -1,4 +1,4 @@
-"""Trials seen from recorded poses: moments, cameras, sheets and films."""
+"""Pictures of a trial from recorded poses: moments, views, sheets and animations."""
 
 from __future__ import annotations
 
@@ -9,23 +9,27 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from datagen.drawing.film import Film, filmstrip_moments, pictures
-from datagen.drawing.filmstrip import Title, write_motion, write_sheet
+from datagen.drawing import film as film_module
+from datagen.drawing.film import Film, filmstrip_moments, write_animation, write_sheet
 from datagen.drawing.posed_robot import RobotBodies, robot_bodies
 from datagen.workers.rendering.embree import RayScene, cast_pixels
 from datagen.workers.scenes.reconstruct import ReconstructedScene
 from datagen.workers.trials import Recording
 from tests.datagen.drawing.trials_to_draw import base_pose, cut, recalled, recording_of, robot
-from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, table_house
+from tests.workers.worlds import ROOM_M, box_body, table_house
 
 pytest.importorskip("pinocchio", reason="needs the extra `sim`")
-SIZES = ((160, 120), (160, 96))
-TITLE = Title("#0a9148", "candidate 3: success", ("a scene", "numbers"))
+WIDE_PX, NEAR_PX = (160, 120), (160, 96)
+COLOUR, LINES = "#0a9148", ("candidate 3: success", "a scene", "numbers")
 
 
-@pytest.fixture(scope="module")
-def scene() -> ReconstructedScene:
-    return recalled()
+@pytest.fixture(scope="module", autouse=True)
+def small_views() -> object:
+    """A tenth of the rays."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(film_module, "WIDE_PX", WIDE_PX)
+        patch.setattr(film_module, "NEAR_PX", NEAR_PX)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -34,33 +38,36 @@ def bodies() -> RobotBodies:
 
 
 @pytest.fixture(scope="module")
-def recording(scene: ReconstructedScene, bodies: RobotBodies) -> Recording:
-    return recording_of(bodies.robot, scene, base_pose())
+def film(bodies: RobotBodies) -> Film:
+    return film_of(recalled(), bodies)
 
 
-@pytest.fixture(scope="module")
-def film(scene: ReconstructedScene, bodies: RobotBodies, recording: Recording) -> Film:
-    moments = filmstrip_moments(recording)
-    return Film(scene, bodies, base_pose(), recording, moments, *SIZES)
+def film_of(scene: ReconstructedScene, bodies: RobotBodies, rows: int | None = None) -> Film:
+    """The film of a hand-made recording, or of its first rows."""
+    recording = recording_of(bodies.robot, scene, base_pose())
+    recording = recording if rows is None else cut(recording, rows)
+    return Film(scene, bodies, base_pose(), recording, filmstrip_moments(recording))
 
 
-def test_eight_moments_tell_a_trial(recording: Recording) -> None:
-    moments = filmstrip_moments(recording)
-    assert [recording.phase[row] for row, _ in moments] == [
-        "reach", "reach", "reach", "approach", "close", "lift", "lift", "hold",
-    ]  # fmt: skip
-    assert moments[0][0] == 0 and moments[-1][0] == len(recording.phase) - 1
+def whole(film: Film, view: film_module.View, row: int) -> RayScene:
+    """The stage of a moment in the house that the view shows."""
+    stage = film.stage(row)
+    return RayScene(view.house, stage.objects, stage.radii_m, stage.T_world_object)
 
 
-@pytest.mark.parametrize("rows", [1, 2, 5, 8, 13, 20])
-def test_a_trial_that_ended_early_is_told_to_its_end(recording: Recording, rows: int) -> None:
-    moments = filmstrip_moments(cut(recording, rows))
-    shown = [row for row, _ in moments]
-    assert len(moments) == min(rows, 8) and shown == sorted(set(shown))
-    assert shown[0] == 0 and shown[-1] == rows - 1
+def test_a_trial_has_eight_moments_in_order(film: Film) -> None:
+    phases = [film.recording.phase[row] for row, _ in film.moments]
+    assert phases == ["reach", "reach", "reach", "approach", "close", "lift", "lift", "hold"]
 
 
-def test_the_fingers_stand_as_far_apart_as_the_hand_is_open(bodies: RobotBodies) -> None:
+@pytest.mark.parametrize("rows", [1, 2, 5, 13, 20])
+def test_moments_begin_and_end_with_the_recording(film: Film, rows: int) -> None:
+    recording: Recording = cut(film.recording, rows)
+    shown = [row for row, _ in filmstrip_moments(recording)]
+    assert shown == sorted(set(shown)) and (shown[0], shown[-1]) == (0, rows - 1)
+
+
+def test_the_gap_between_the_fingers_is_the_opening(bodies: RobotBodies) -> None:
     q, T = bodies.robot.homes_rad[0], base_pose()
     left, right = bodies.hand
     gaps = []
@@ -74,96 +81,62 @@ def test_the_fingers_stand_as_far_apart_as_the_hand_is_open(bodies: RobotBodies)
 
 
 def test_the_robot_stands_on_the_floor(bodies: RobotBodies) -> None:
-    T = bodies.poses(base_pose(), bodies.robot.homes_rad[0], 0.08)
-    lowest = min(
-        float((rays.mesh.vertices_m @ pose[2, :3] + pose[2, 3]).min())
-        for rays, pose in zip(bodies.rays, T, strict=True)
-    )
-    assert lowest == pytest.approx(0.0, abs=1e-6)
+    poses = bodies.poses(base_pose(), bodies.robot.homes_rad[0], 0.08)
+    heights = [rays.mesh.vertices_m @ T[2, :3] + T[2, 3] for rays, T in zip(bodies.rays, poses, strict=True)]
+    assert min(float(z.min()) for z in heights) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_both_views_show_target_and_hand(film: Film, bodies: RobotBodies) -> None:
     row = next(row for row, words in film.moments if words == "at the grasp")
-    stage = film.stage(row)
-    for shot in film.shots:
-        full = RayScene(shot.house, stage.objects, stage.radii_m, stage.T_world_object)
-        n = shot.camera.width_px * shot.camera.height_px
-        body = cast_pixels(full, shot.camera, np.arange(n)).body - 1
-        hand = [2 + k for k in bodies.hand]
-        assert (body == 0).sum() > 30 and np.isin(body, hand).sum() > 10
+    for view, (w, h) in zip(film.views, (WIDE_PX, NEAR_PX), strict=True):
+        body = cast_pixels(whole(film, view, row), view.camera(1), np.arange(w * h)).body - 1
+        assert (body == 0).sum() > 30 and np.isin(body, [2 + k for k in bodies.hand]).sum() > 10
 
 
-def test_a_picture_is_what_the_renderer_shows(film: Film) -> None:
-    """Casting body by body into its own window gives the frame of the whole stage."""
-    stage = film.stage(0)
-    (_, near), *_ = pictures(film, [0], 1)
-    shot = film.shots[1]
-    full = RayScene(shot.house, stage.objects, stage.radii_m, stage.T_world_object)
-    whole = cast_pixels(full, shot.camera, np.arange(near.shape[0] * near.shape[1])).rgb
-    assert (whole.reshape(near.shape) == near).all(axis=2).mean() > 0.9999
+def test_a_picture_is_that_of_the_renderer(film: Film) -> None:
+    view, (w, h) = film.views[1], NEAR_PX
+    rendered = cast_pixels(whole(film, view, 0), view.camera(1), np.arange(w * h)).rgb.reshape(h, w, 3)
+    assert (np.asarray(view.picture(film.stage(0), 1)) == rendered).all(axis=2).mean() > 0.9999
 
 
-def test_walls_before_the_camera_are_left_out(bodies: RobotBodies) -> None:
-    """In a closet no camera has room: it stands outside, and the walls before it are gone."""
+def test_walls_in_front_of_the_camera_are_left_out(bodies: RobotBodies) -> None:
+    """No camera has room in a closet: it stands outside, and the walls in front of it are gone."""
     cx, cy = ROOM_M[0] / 2, ROOM_M[1] / 2
     sides = [((2.4, 0.1, 2.5), 0, s) for s in (-1.1, 1.1)] + [((0.1, 2.2, 2.5), s, 0) for s in (-1.1, 1.1)]
     closet = [
         box_body(f"closet|{k}", "wall", "Wall", size, (cx + dx, cy + dy, 1.25))
         for k, (size, dx, dy) in enumerate(sides)
     ]
-    scene = recalled(table_house(closet))
-    recording = recording_of(bodies.robot, scene, base_pose())
-    film = Film(scene, bodies, base_pose(), recording, filmstrip_moments(recording), (96, 72), (96, 72))
-    eye_m = film.shots[0].camera.T_world_camera[:2, 3]
-    assert np.abs(eye_m - (cx, cy)).max() > 1.1  # outside
-    stage = film.stage(len(recording.phase) - 1)
-    full = RayScene(film.shots[0].house, stage.objects, stage.radii_m, stage.T_world_object)
-    body = cast_pixels(full, film.shots[0].camera, np.arange(96 * 72)).body - 1
+    film = film_of(recalled(table_house(closet)), bodies)
+    view, (w, h) = film.views[0], WIDE_PX
+    assert np.abs(view.T[:2, 3] - (cx, cy)).max() > 1.1  # outside
+    last = len(film.recording.phase) - 1
+    body = cast_pixels(whole(film, view, last), view.camera(1), np.arange(w * h)).body - 1
     assert (body == 0).any() and (body >= 2).sum() > 200
 
 
-def test_nothing_before_the_lens_is_higher_than_the_ceiling(film: Film) -> None:
-    for shot in film.shots:
-        assert TABLE_TOP_M < shot.camera.T_world_camera[2, 3] < 3.5
-
-
-def test_a_sheet_has_eight_moments(film: Film, tmp_path: Path) -> None:
-    out = tmp_path / "sheet.png"
-    write_sheet(film, TITLE, out)
-    with Image.open(out) as image:
-        assert image.format == "PNG" and image.size[0] == 10 + 4 * (SIZES[0][0] + 10)
+def test_a_sheet_has_eight_moments_and_is_repeatable(film: Film, tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        write_sheet(film, COLOUR, LINES, tmp_path / name)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.size[0] == 10 + 4 * (WIDE_PX[0] + 10)
         pixels = np.asarray(image.convert("RGB"))
-    chip = pixels[20, 15]
-    assert tuple(chip) == (0x0A, 0x91, 0x48)
-    first, last = pixels[160:260, 10:170], pixels[-210:-110, -170:-10]
-    assert (first != last).any()
+    assert tuple(pixels[20, 15]) == (0x0A, 0x91, 0x48)
+    assert (pixels[-100:-20, 10:170] != pixels[-100:-20, -170:-10]).any()  # near views of moments 5 and 8
 
 
-def test_a_sheet_of_one_pose(
-    scene: ReconstructedScene, bodies: RobotBodies, recording: Recording, tmp_path: Path
-) -> None:
-    still = cut(recording, 1)
-    film = Film(scene, bodies, base_pose(), still, filmstrip_moments(still), *SIZES)
-    write_sheet(film, TITLE, tmp_path / "one.png")
+def test_a_sheet_of_one_pose_has_room_for_its_title(bodies: RobotBodies, tmp_path: Path) -> None:
+    write_sheet(film_of(recalled(), bodies, rows=1), COLOUR, LINES, tmp_path / "one.png")
     with Image.open(tmp_path / "one.png") as image:
-        assert image.size[0] == 10 + 2 * (SIZES[0][0] + 10)
+        pixels = np.asarray(image.convert("L"))
+    assert (pixels[:, -10:] == 255).all() and (pixels[:, -60:-10] < 255).any()
 
 
-def test_a_film_moves(
-    scene: ReconstructedScene, bodies: RobotBodies, recording: Recording, tmp_path: Path
-) -> None:
-    moments = filmstrip_moments(recording)
-    film = Film(scene, bodies, base_pose(), recording, moments, *SIZES)
-    out = tmp_path / "film.gif"
-    write_motion(film, TITLE, out)
-    with Image.open(out) as image:
+def test_an_animation_moves(film: Film, tmp_path: Path) -> None:
+    write_animation(film, COLOUR, LINES, tmp_path / "film.gif")
+    with Image.open(tmp_path / "film.gif") as image:
         frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(image)]
         assert image.info["loop"] == 0
     assert len(frames) == 16  # 1.5 s at ten a second, and the first
     assert all((a != b).any() for a, b in pairwise(frames))
-
-
-def test_films_are_equal_again(film: Film, tmp_path: Path) -> None:
-    for name in ("a.png", "b.png"):
-        write_sheet(film, TITLE, tmp_path / name)
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
