@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import textwrap
+from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
@@ -25,8 +26,7 @@ _MOST_CHARACTERS = 60  # in a name: a longer one leaves no room for axes
 
 def new_sheet(title: str, height_in: float) -> Figure:
     """An empty figure of the common width with automatic layout."""
-    figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_picture(_WIDTH_IN, height_in)
     figure.suptitle(title, fontsize=13)
     return figure
 
@@ -72,6 +72,20 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasSVG(figure)
     return figure
+
+
+def new_picture(width_in: float, height_in: float) -> Figure:
+    """An empty figure that becomes an image of pixels, with constrained layout."""
+    figure = Figure(figsize=(width_in, height_in), dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def webp_of(figure: Figure) -> str:
+    """The figure as the `data:` address of a WebP image."""
+    with io.BytesIO() as packed:
+        figure.savefig(packed, format="webp", pil_kwargs={"quality": 82})
+        return "data:image/webp;base64," + b64encode(packed.getvalue()).decode()
 
 
 def svg_of(figure: Figure, name: str) -> str:
