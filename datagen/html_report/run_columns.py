@@ -82,14 +82,14 @@ def read_columns(run: Run) -> RunColumns | None:
         is_clear=joined["base_is_clear"] == 1,
         is_within_reach=joined["mount_distance_m"] <= joined["arm_reach_m"],
         distance_m=joined["distance_m"].astype(np.float64),
-        offset_m=_turned(joined, scene),
+        offset_m=turned(joined, scene),
         outcome=joined.get("outcome"),
         shards=len(read),
         of=len(committed),
     )
 
 
-def _turned(joined: dict[str, Array], scene: npt.NDArray[np.int64]) -> F64:
+def turned(joined: dict[str, Array], scene: npt.NDArray[np.int64]) -> F64:
     """Bases (N, 2) from their target, in axes in which the camera looks along +y."""
     target = joined["target_center_m"][:, :2].astype(np.float64)
     towards = target - joined["T_world_camera"][:, :2, 3]
