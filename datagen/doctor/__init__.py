@@ -2,100 +2,243 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+import platform
+import resource
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Literal
 
+import psutil
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from datagen.console.options import AsJson
-from datagen.console.printing import print_json
-from datagen.doctor.check import Check, Status
-from datagen.doctor.engines import arm_checks, engine_checks
-from datagen.doctor.host import host_checks
-from datagen.schemas.errors import InputError
+from datagen.console.printing import print_json, size
+from datagen.doctor import engines
+from datagen.workers.content_cache import cache_folder
 from datagen.workers.extras import EXTRAS, how_to_get
+from datagen.workers.robots import ROBOTS, robot_limits
 
+Status = Literal["ok", "warn", "fail"]
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
+_CGROUP = Path("/sys/fs/cgroup")
+# A worker with houses, meshes and an engine needs about half of this; 180,000 labels take 0.4 GiB of a disk.
+_ENOUGH_MEMORY_BYTES = _ENOUGH_DISK_BYTES = 2 * 2**30
+# Ray keeps its objects here and is slow without; containers often start with 64 MiB.
+_ENOUGH_SHM_BYTES = 2**28
+_ENOUGH_OPEN_FILES = 4096
+# Shared library -> its Debian and Ubuntu package. The first three are for SAPIEN, the last for arm libraries.
+_LIBRARIES = {
+    "libX11.so.6": "libx11-6",
+    "libGL.so.1": "libgl1",
+    "libgthread-2.0.so.0": "libglib2.0-0",
+    "libgomp.so.1": "libgomp1",
+}
+_AGAIN = "Install it again: pip install --force-reinstall"
+_MESA_FIX = (
+    "Only --renderer sapien needs one; on a CPU it works with Mesa 25 or newer: "
+    "on Debian 12 apt-get install -t bookworm-backports mesa-vulkan-drivers"
+)
+# Mount height for robots that allow any.
+_HEIGHT_M = 0.5
 
 
-def _count(name: str, ref: str, names: Callable[[], Sequence[str]]) -> Check:
+class Problem(Exception):
+    """What a check found; `status` replaces that of the check."""
+
+    def __init__(self, text: str, status: Status | None = None) -> None:
+        super().__init__(text)
+        self.status: Status | None = status
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check: `find` returns what it found, or raises Problem or OSError."""
+
+    name: str
+    find: Callable[[], str]
+    fix: str = ""
+    failed: Status = "warn"  # `fail`: labels cannot be made; `warn`: a feature is missing
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report."""
+
+    name: str
+    status: Status
+    detail: str
+    fix: str = ""
+
+
+def checks() -> Iterator[Check]:
+    """All checks of this machine, in the order of the report."""
+    yield Check("python", lambda: f"{platform.python_version()} at {sys.executable}")
+    yield Check("platform", _platform, "Only Linux is tested: use a Linux machine or container.")
+    yield Check("cores", _cores, "Use as many --workers, or raise the container's limit.")
+    yield Check("memory", _memory, "Use --workers 1, or free some memory.")
+    yield Check("disk", partial(_free, Path.cwd(), _ENOUGH_DISK_BYTES), "Work on another disk.")
+    shm_fix = "Start the container with --shm-size=1g; without it Ray is slower."
+    yield Check("shared memory", partial(_free, Path("/dev/shm"), _ENOUGH_SHM_BYTES), shm_fix)
+    yield Check("open files", _open_files, "Raise it before starting: ulimit -n 65536")
+    yield Check(
+        "cache", _cache, "Set DATAGEN_CACHE to a writable folder; without one files are parsed again."
+    )
+    for library, package in _LIBRARIES.items():
+        yield Check(library, partial(_load, library), f"apt-get install -y {package}")
+    for name in EXTRAS:
+        yield Check(f"extra {name}", partial(_extra, name), how_to_get(name), "ok")
+    settlers = {"sapien": engines.SAPIEN_PHYSICS, "pybullet": engines.PYBULLET}
+    if installed := [name for name in settlers if find_spec(name)]:
+        fix = f"Install the libraries named above, or: {_AGAIN} {' '.join(installed)}"
+        yield Check("settlers", partial(_any_of, {name: settlers[name] for name in installed}), fix, "fail")
+    if find_spec("embreex"):
+        yield Check("embree", partial(_probe, engines.EMBREE), f"{_AGAIN} embreex", "fail")
+    if find_spec("sapien"):
+        yield Check("sapien render device", partial(_probe, engines.SAPIEN_RENDER), _MESA_FIX)
+    if find_spec("ray"):
+        yield Check("ray", partial(_probe, engines.RAY), f"{_AGAIN} ray; or use --workers 0.")
+    if not EXTRAS["sim"].missing():
+        again = f"{_AGAIN} pin coal mani-skill"
+        yield Check(
+            "arm libraries", partial(_probe, engines.LIBRARIES), f"Plan and sim labels need them. {again}"
+        )
+        for name in ROBOTS:
+            limits = robot_limits(name)
+            height_m = limits.base_height_m[0] if limits.base_height_m else _HEIGHT_M
+            code = engines.ROBOT.format(name=name, reach_m=limits.reach_m[1], height_m=height_m)
+            yield Check(f"robot {name}", partial(_probe, code), f"Use another --robot, or: {again}")
+        fix = "See the settlers and robots above; plan labels need no physics."
+        yield Check("grasp trial", partial(_probe, engines.TRIAL), fix)
+
+
+def found(check: Check) -> Finding:
+    """What a check finds here."""
     try:
-        n = len(names())
-    except InputError as error:
-        return Check(name, "fail", f"{error.place}: {error.problem}", error.fix)
-    if n == 0:
-        return Check(name, "fail", f"{ref}: none", f"Name a folder with {name}.")
-    return Check(name, "ok", f"{n} from {ref}")
+        return Finding(check.name, "ok", check.find())
+    except (Problem, OSError) as problem:
+        status = problem.status if isinstance(problem, Problem) else None
+        return Finding(check.name, status or check.failed, str(problem), check.fix)
 
 
-def asset_checks(houses: str | None, objects: str | None) -> list[Check]:
-    """Checks of houses and objects: those given, else those in DATAGEN_ASSETS, else the built-in ones."""
-    from datagen.workers.houses import open_houses
-    from datagen.workers.objects import open_objects
-
-    root = os.environ.get("DATAGEN_ASSETS")
-    if root and houses is None and (Path(root) / "procthor").is_dir():
-        houses = f"procthor:{Path(root) / 'procthor'}"
-    if root and objects is None and (Path(root) / "ycb").is_dir():
-        objects = f"ycb:{Path(root) / 'ycb'}"
-    houses, objects = houses or "builtin", objects or "builtin"
-    return [
-        _count("houses", houses, lambda: open_houses(houses).house_ids()),
-        _count("objects", objects, lambda: open_objects(objects).names()),
-    ]
+def _platform() -> str:
+    if sys.platform != "linux":
+        raise Problem(platform.platform())
+    return f"{platform.platform()}, {platform.machine()}"
 
 
-def extra_checks() -> list[Check]:
-    """One check per extra: its features, and how to install it. Only `labels` is required."""
-    checks: list[Check] = []
-    for name, extra in EXTRAS.items():
-        if missing := extra.missing():
-            status: Status = "fail" if name == "labels" else "ok"
-            problem = f"not installed ({', '.join(missing)}); would give {extra.gives}"
-            checks.append(Check(f"extra {name}", status, problem, how_to_get(name)))
-        else:
-            checks.append(Check(f"extra {name}", "ok", extra.gives))
-    return checks
+def _limit(name: str) -> str:
+    """First word of a control-group file of this container; "" or "max" where there is no limit."""
+    path = _CGROUP / name
+    return path.read_text().partition(" ")[0].strip() if path.is_file() else ""
 
 
-def as_table(checks: list[Check]) -> Table:
-    """A table with one row per check; the fix is below the finding."""
+def _cores() -> str:
+    text = f"{len(os.sched_getaffinity(0))} of {os.cpu_count()} usable"
+    if (quota_us := _limit("cpu.max")).isdigit():  # per 0.1 s
+        cores = int(quota_us) / 1e5
+        if cores < len(os.sched_getaffinity(0)):
+            raise Problem(f"{text}, limited to {cores:.1f} by the container")
+    return text
+
+
+def _memory() -> str:
+    free_bytes = psutil.virtual_memory().available
+    if (limit := _limit("memory.max")).isdigit():
+        free_bytes = min(free_bytes, int(limit) - int(_limit("memory.current") or 0))
+    return _enough(free_bytes, _ENOUGH_MEMORY_BYTES, "free")
+
+
+def _free(folder: Path, enough_bytes: int) -> str:
+    return _enough(shutil.disk_usage(folder).free, enough_bytes, f"free in {folder}")
+
+
+def _enough(n_bytes: int, enough_bytes: int, where: str) -> str:
+    text = f"{size(n_bytes)} {where}"
+    if n_bytes < enough_bytes:
+        raise Problem(f"{text}, of {size(enough_bytes)} that are enough")
+    return text
+
+
+def _open_files() -> str:
+    limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if limit != resource.RLIM_INFINITY and limit < _ENOUGH_OPEN_FILES:
+        raise Problem(f"{limit}; Ray opens hundreds for each worker")
+    return "no limit" if limit == resource.RLIM_INFINITY else str(limit)
+
+
+def _cache() -> str:
+    folder = cache_folder()
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    with tempfile.TemporaryFile(dir=existing):
+        return str(folder)
+
+
+def _load(library: str) -> str:
+    ctypes.CDLL(library)
+    return "found"
+
+
+def _extra(name: str) -> str:
+    if missing := EXTRAS[name].missing():
+        text = f"not installed ({', '.join(missing)}); would give {EXTRAS[name].gives}"
+        raise Problem(text, "fail" if name == "labels" else None)  # the others are a choice
+    return EXTRAS[name].gives
+
+
+def _probe(code: str) -> str:
+    answer = engines.probe(code)
+    if not answer.succeeded:
+        raise Problem(answer.text)
+    return answer.text
+
+
+def _any_of(codes: dict[str, str]) -> str:
+    """One working settler is enough: a broken one beside it is a warning."""
+    answers = {name: engines.probe(code) for name, code in codes.items()}
+    text = "; ".join(a.text if a.succeeded else f"{name}: {a.text}" for name, a in answers.items())
+    if not all(answer.succeeded for answer in answers.values()):
+        raise Problem(text, "warn" if any(answer.succeeded for answer in answers.values()) else "fail")
+    return text
+
+
+def as_table(findings: list[Finding]) -> Table:
+    """A table with one row per finding; the fix is below it."""
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column(no_wrap=True)
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    for check in checks:
+    for each in findings:
         # Text, because brackets in paths and messages are not markup.
-        finding = Text(check.detail)
-        if check.fix:
-            finding.append(f"\n-> {check.fix}", style="cyan")
-        table.add_row(Text(check.status, style=_COLOURS[check.status]), check.name, finding)
+        detail = Text(each.detail)
+        if each.fix:
+            detail.append(f"\n-> {each.fix}", style="cyan")
+        table.add_row(Text(each.status, style=_COLOURS[each.status]), each.name, detail)
     return table
 
 
-def doctor(*, json: AsJson = False, houses: str | None = None, objects: str | None = None) -> int:
+def doctor(*, json: AsJson = False) -> int:
     """Check this machine, and show how to fix what is missing.
 
     Exit code 0 when labels can be made here, else 1.
-
-    Args:
-        houses: Houses to check: builtin, procthor:DIR or ai2thor:DIR.
-        objects: Objects to check: builtin or ycb:DIR.
     """
-    checks = [*host_checks(), *extra_checks(), *engine_checks(), *arm_checks()]
-    if not EXTRAS["labels"].missing():
-        checks += asset_checks(houses, objects)
-    failures = sum(check.status == "fail" for check in checks)
+    findings = [found(check) for check in checks()]
+    failures = sum(each.status == "fail" for each in findings)
     if json:
-        print_json({"ok": not failures, "checks": [asdict(check) for check in checks]})
+        print_json({"ok": not failures, "checks": [asdict(each) for each in findings]})
     else:
         console = Console(highlight=False)
-        console.print(as_table(checks))
-        warnings = sum(check.status == "warn" for check in checks)
+        console.print(as_table(findings))
+        warnings = sum(each.status == "warn" for each in findings)
         verdict = "labels can be made here" if not failures else "labels cannot be made here yet"
         console.print(f"\n{verdict}: {failures} failed, {warnings} warned")
     return 1 if failures else 0
