@@ -31,10 +31,10 @@ from datagen.display.progress import counting
 from datagen.schemas.cost import StageClock
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scenes
+from datagen.train.bootstrap import resample_weights, resampled_area_under_roc
 from datagen.train.encoded_runs import EncodedBatches, EncodedRuns, encode_runs, encoded_stream
-from datagen.train.evaluation.bootstrap import resample_weights, resampled_area_under_roc
-from datagen.train.evaluation.metrics import area_under_roc
 from datagen.train.inputs import F32, F64, Array, Bools
+from datagen.train.metrics import area_under_roc
 from datagen.train.models import Model, build_model
 from datagen.train.models.hand_poses import HAND_WIDTH, N_MEASURES
 from datagen.train.models.shared import SharedModel

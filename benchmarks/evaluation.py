@@ -14,9 +14,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from datagen.train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, weights_for
+from datagen.evaluation.comparisons import Method
+from datagen.evaluation.scores import evaluate_grids, evaluate_set, weights_for
 from datagen.workers.bases.candidate_sets import CANDIDATE_SETS
-from tests.train.evaluation.made_columns import make_columns
+from tests.datagen.evaluation.made_columns import make_columns
 
 
 def main() -> None:

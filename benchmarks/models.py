@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from datagen.train.dataset import SampleStream
-from datagen.train.evaluation.metrics import accuracy, area_under_roc, balanced_accuracy, confusion
 from datagen.train.inputs import Batch
+from datagen.train.metrics import accuracy, area_under_roc, balanced_accuracy, confusion
 from datagen.train.models.shared import SharedModel
 from datagen.train.models.tokens import Tokens
 from datagen.train.tensors import to_torch

@@ -31,7 +31,7 @@ from datagen.schemas.fields import SceneRows
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scenes
 from datagen.schemas.specification import Specification
-from datagen.train.evaluation.bootstrap import resample_weights
+from datagen.train.bootstrap import resample_weights
 from datagen.workers.bases.candidates import SceneCandidates, distances
 from datagen.workers.labels.arm_labelling import ArmInScene, arm_in_scene, try_candidate
 from datagen.workers.scenes import SettledScene

@@ -61,10 +61,6 @@ _HEADINGS: dict[str, dict[str, tuple[str, str]]] = {
     "Models": {
         "train": ("datagen.commands.train:train_model", "Train a model on labels."),
         "evaluate": ("datagen.commands.evaluate:evaluate", "Compare models with baselines and the paper."),
-        "closed-loop": (
-            "datagen.commands.closed_loop:closed_loop",
-            "Execute methods' picks with arrival errors.",
-        ),
         "calibrate": (
             "datagen.commands.calibrate:calibrate",
             "Fit the heuristic's parameters to trial labels.",

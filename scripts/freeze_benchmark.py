@@ -12,8 +12,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from datagen.benchmark.definition import Benchmark, BenchmarkRun, read_benchmark
-from datagen.benchmark.frozen_runs import digests_of
+from datagen.evaluation.benchmark import Benchmark, BenchmarkRun, digests_of, read_benchmark
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.whole_files import whole_file

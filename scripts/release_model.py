@@ -19,6 +19,7 @@ from typing import Any
 
 from datagen import released
 from datagen.commands.predict import predict
+from datagen.evaluation.report_tables import DECISIONS
 from datagen.released.card import card_text
 from datagen.schemas.errors import InputError
 from datagen.schemas.whole_files import whole_file
@@ -29,33 +30,19 @@ from datagen.train.training.checkpoints import Checkpoint, load_model, read_chec
 MOST_BYTES = 5_000_000
 
 
-def results_of(path: Path, checkpoint: Path) -> dict[str, Any]:
-    """The leaderboard with the one line of this checkpoint. InputError where it has none."""
+def results_of(path: Path, checkpoint: Path) -> tuple[dict[str, Any], str]:
+    """The report of the benchmark, and the name of this checkpoint in it. InputError where it has none."""
     try:
         report = json.loads(path.read_bytes())
-        methods = {m["name"]: m for m in report["methods"] if m.get("checkpoint")}
+        methods = {m["name"]: m["checkpoint"] for m in report["methods"] if m["checkpoint"]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         fix = "Give a file of `datagen benchmark score --out`"
-        raise InputError(path, "", f"is no leaderboard ({error})", fix) from None
+        raise InputError(path, "", f"is no report of the benchmark ({error})", fix) from None
     digest = weights_sha256(load_model(checkpoint)[0])
     for name, record in methods.items():
-        if record["checkpoint"]["weights_sha256"] == digest:
-            return _only(report, name, record)
+        if record["weights_sha256"] == digest:
+            return report, name
     raise InputError(path, "methods", f"has no line of the weights of {checkpoint}", "Score the checkpoint")
-
-
-def _only(report: dict[str, Any], name: str, record: dict[str, Any]) -> dict[str, Any]:
-    """The report without other methods, the line under the name of the released model."""
-
-    def cut(value: Any) -> Any:
-        if isinstance(value, dict):
-            known = {k: cut(v) for k, v in value.items() if k not in ("differences", "means")}
-            if isinstance(methods := known.get("methods"), dict):
-                known["methods"] = {released.RELEASED: methods[name]}
-            return known
-        return [cut(each) for each in value] if isinstance(value, list) else value
-
-    return {**cut(report), "methods": [{**record, "name": released.RELEASED}], "fitted_on": []}
 
 
 def ship(source: Path, target: Path) -> None:
@@ -69,7 +56,7 @@ def ship(source: Path, target: Path) -> None:
     draft.replace(target)
 
 
-def facts_of(path: Path, results: dict[str, Any]) -> dict[str, Any]:
+def facts_of(path: Path, report: dict[str, Any], name: str) -> dict[str, Any]:
     """The card of the shipped checkpoint at `path`."""
     checkpoint = read_checkpoint(path)
     head = checkpoint.head
@@ -93,27 +80,24 @@ def facts_of(path: Path, results: dict[str, Any]) -> dict[str, Any]:
         "objects": len(head.object_digests),
         "cost": head.cost,
         "versions": head.versions,
-        "benchmark": {key: results["benchmark"][key] for key in ("version", "digest")},
-        "metrics": metrics_of(results),
+        "benchmark": {key: report["benchmark"][key] for key in ("version", "digest")},
+        "metrics": metrics_of(report, name),
         "demo": demo_answer(scorer),
     }
 
 
-def metrics_of(results: dict[str, Any]) -> dict[str, Any]:
-    """The numbers that the card names, by run."""
-    name = released.RELEASED
-    found: dict[str, Any] = {
-        run: {"count": table["candidates"], "scenes": table["scenes"], **table["methods"][name]}
-        for run, table in results["candidates"].items()
-    }
-    for run, table in results["grids"].items():
-        for which in ("mixed", "hard"):
-            if (part := table[which]) is not None:
-                found[f"{run}, {which}"] = {
-                    "scenes": part["scenes"],
-                    "good": part["methods"][name]["good"],
-                    "arrivals": {row["arrival"]: row["methods"][name] for row in part["arrivals"]},
-                }
+def metrics_of(report: dict[str, Any], name: str) -> dict[str, Any]:
+    """The numbers that the card names, by part of the report."""
+    found: dict[str, Any] = {}
+    for part in report["parts"]:
+        if grids := part["grids"]:
+            arrivals = {row["arrival"]: row["methods"][name] for row in grids["arrivals"]}
+            good = grids["methods"][name]["good"]
+            found[part["title"]] = {"scenes": grids["scenes"], "good": good, "arrivals": arrivals}
+        for scores in part["sets"].values():
+            kept = (*DECISIONS, "expected_calibration_error", "brier")
+            metrics = {key: scores["methods"][name][key] for key in kept}
+            found[part["title"]] = {"count": scores["count"], "scenes": scores["scenes"], **metrics}
     return found
 
 
@@ -139,23 +123,21 @@ def demo_answer(scorer: ModelScorer) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Write checkpoint, results and card."""
+    """Write checkpoint and card."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("benchmark", type=Path)
     options = parser.parse_args()
     target = released.FOLDER / released.CHECKPOINT
     try:
-        results = results_of(options.benchmark, options.checkpoint)
+        report, name = results_of(options.benchmark, options.checkpoint)
         ship(options.checkpoint, target)
-        card = facts_of(target, results)
+        card = facts_of(target, report, name)
     except InputError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
-    files = {released.RESULTS: results, released.CARD: card}
-    for name, values in files.items():
-        with whole_file(released.FOLDER / name, alone=True) as file:
-            file.write((json.dumps(values, indent=1, allow_nan=False) + "\n").encode())
+    with whole_file(released.FOLDER / released.CARD, alone=True) as file:
+        file.write((json.dumps(card, indent=1, allow_nan=False) + "\n").encode())
     with whole_file(released.FOLDER / released.CARD_PAGE, alone=True) as file:
         file.write(card_text(card, (released.FOLDER / released.RECIPE).read_text("utf-8")).encode())
     size, weights = card["bytes"], card["weights_sha256"][:12]

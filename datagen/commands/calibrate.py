@@ -13,12 +13,12 @@ from cyclopts import Parameter
 from datagen.console.options import AllowIncomplete, AsJson, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.display.progress import steps
-from datagen.evaluation_report.report_tables import with_interval
+from datagen.evaluation.report_tables import with_interval
 from datagen.reports.specification_summary import specification_record
 from datagen.schemas.errors import InputError, one_line, printable
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.specification import HeuristicParams, Specification
-from datagen.train.evaluation.bootstrap import Estimate
+from datagen.train.bootstrap import Estimate
 from datagen.train.heuristic_fit import (
     FOLDS,
     FORMS,

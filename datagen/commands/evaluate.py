@@ -2,38 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.console.command_lines import prints
-from datagen.console.options import (
-    AllowIncomplete,
-    AsJson,
-    File,
-    PathsOrAddresses,
-    Whole,
-    refuse_odd_draws,
-    refuse_output,
-)
-from datagen.console.printing import print_json, print_rows
+from datagen.console.command_lines import print_interrupted, prints
+from datagen.console.options import AS_FOUND, AsJson, AssetSources, File, PathsOrAddresses, Whole
+from datagen.evaluation.output import Outputs, output_files, print_report, write_report
 from datagen.schemas.errors import InputError
-from datagen.schemas.whole_files import whole_file
 
-
-def print_report(report: dict[str, Any], json: bool, html: Path | None = None, **_: Any) -> int:
-    """Print the tables of an evaluation."""
-    if json:
-        print_json(report)
-        return 0
-    from datagen.evaluation_report.report_tables import print_evaluation
-
-    print_evaluation(report)
-    if html is not None:
-        print_rows("written", [("page", str(html))])
-    return 0
+_MOST_WORKERS = 256
 
 
 @prints(print_report)
@@ -41,20 +23,17 @@ def evaluate(
     paths: Annotated[Sequence[str | Path], Parameter(name="PATH...")],
     /,
     *,
-    candidates: Sequence[Literal["grid", "clear", "in-range"]] | None = None,
     fit: PathsOrAddresses | None = None,
     baselines: Sequence[str] | None = None,
     detector: File | None = None,
     heuristic: File | None = None,
-    arrival: str | None = None,
-    arrival_std: str | None = None,
-    bootstrap: Whole = 1000,
-    seed: Whole = 0,
+    arrival: Sequence[str] | None = None,
+    closed_loop: Whole | None = None,
+    execute: bool = False,
+    workers: Whole | None = None,
+    given: AssetSources = AS_FOUND,
     allow_seen_houses: bool = False,
-    allow_incomplete: AllowIncomplete = False,
-    allow_mixed_labels: bool = False,
-    threads: Whole | None = None,
-    html: File | None = None,
+    out: Outputs = None,
     json: AsJson = False,
 ) -> dict[str, Any]:
     """Compare models with baselines and the paper: accuracy, reach, grid selection and calibration.
@@ -63,80 +42,96 @@ def evaluate(
     within the arm's reach), with intervals by resampling scenes. Files are checkpoints; folders and s3://
     addresses are runs. Runs with a house that a model was trained on are refused.
 
-    For example: datagen evaluate model.ckpt runs/sim-test --html report.html
+    With --closed-loop a robot is sent to each method's picks on whole grids, arrives off them, and plans from
+    there. Outcomes are kept next to the output: after Ctrl-C, or with more methods, the same command makes
+    only the missing ones.
+
+    For example: datagen evaluate model.ckpt runs/sim-test --out report.html
 
     Args:
         paths: Checkpoints of `datagen train`, or `released`, and runs of sim or plan labels.
-        candidates: Candidate set to report; repeat for more. [default: all in the runs]
         fit: Run in validation houses to fit baselines on; repeat for more.
         baselines: Baseline to compare with, or none; repeat for more. [default: all]
         detector: Folder of a zero-shot object detector, for the detector baseline.
         heuristic: Parameters of the analytic baseline, from `datagen calibrate`.
-        arrival: Arrival error to report too: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv.
-        arrival_std: The same as --arrival normal:, in metres, with yaw after a comma: 0.05,3deg.
-        bootstrap: Resamples of scenes for each interval.
-        seed: Seed of the resamples and example scenes.
+        arrival: Arrival error: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv. [default: 0 to 25 cm]
+        closed_loop: Scenes of the closed loop, the first whole grids with a good base pose. [default: 0]
+        execute: Execute the plans of the closed loop in disturbed physics, which takes most of the time.
+        workers: Processes of the closed loop; 0: this process, for debuggers. [default: cores]
         allow_seen_houses: Report training houses separately instead of failing.
-        allow_incomplete: Accept runs that lack planned samples instead of failing.
-        allow_mixed_labels: Accept labels of one source in different versions instead of failing.
-        threads: CPU threads of the models. [default: chosen by torch]
-        html: HTML page to write, with tables, curves and example grids.
-        json: Report progress as JSON lines.
+        out: File to write, .json or .html; repeat for both.
+        json: Print one JSON document, and progress as JSON lines.
 
     Returns:
-        Tables and curves, as `datagen evaluate --json` prints them (docs/guides/evaluate.md).
+        All numbers, as `datagen evaluate --json` prints them (docs/guides/evaluate.md).
 
     Raises:
         InputError: A checkpoint, a run or an option cannot be used.
 
     Example:
-        >>> report = datagen.evaluate([checkpoint, sim_run], baselines=["proximity"], bootstrap=10)
-        >>> len(report["methods"]), report["candidates"]
+        >>> report = datagen.evaluate([checkpoint, sim_run], baselines=["proximity"])
+        >>> len(report["methods"]), list(report["parts"][0]["sets"])
         (2, ['in-range'])
     """
     # Imported here, so that other verbs do not wait for them and for torch.
-    from datagen.evaluation_report.evaluated_runs import (
-        candidate_sets_of,
-        open_evaluated_runs,
+    from datagen.evaluation.methods import (
+        baseline_methods,
+        open_models,
+        read_heuristic,
         refuse_seen_houses,
-        split_paths,
+        score_runs,
     )
-    from datagen.evaluation_report.methods import baseline_methods, open_models, read_heuristic
-    from datagen.evaluation_report.report import evaluation_report
-    from datagen.evaluation_report.scoring import score_runs
-    from datagen.train.arrivals import arrival_of
+    from datagen.evaluation.report import evaluation_report, parts_by_houses
+    from datagen.evaluation.runs import candidate_sets_of, open_evaluated_runs, split_paths
+    from datagen.train.arrivals import read_arrival
 
-    fit = [str(path) for path in fit or ()]
-    detector, heuristic, html = (None if p is None else Path(p) for p in (detector, heuristic, html))
-    refuse_odd_draws(bootstrap, seed)
-    error = arrival_of(arrival, arrival_std)
-    if threads is not None and not 1 <= threads <= 1024:
-        raise InputError("--threads", str(threads), "is below 1", "Give 1 or more")
-    if html is not None:
-        refuse_output(html, "--html", ".html", ".htm")
-    checkpoints, runs = split_paths([str(path) for path in paths])
-    if threads is not None:
-        from datagen.train.scorers import use_threads
-
-        use_threads(threads)
-    opened = open_evaluated_runs(runs, allow_incomplete, allow_mixed_labels)
-    sets = candidate_sets_of(opened, candidates or [])
-    models = open_models(checkpoints)
+    files = output_files(out)
+    arrivals = [read_arrival(text) for text in arrival or ()]
+    if closed_loop:
+        _refuse_bad_loop(closed_loop, execute, workers, files)
+    checkpoints, run_paths = split_paths([str(path) for path in paths])
+    runs, models = open_evaluated_runs(run_paths), open_models(checkpoints)
     if not allow_seen_houses:
-        refuse_seen_houses(opened, models)
-    rule = read_heuristic(heuristic, opened, allow_seen_houses) if heuristic is not None else None
-    baseline_set = baseline_methods(
-        baselines, fit, detector, rule, seed, opened, allow_seen_houses, allow_incomplete, json
-    )
-    evaluated = [*baseline_set.baselines, *models]
-    if not evaluated:
+        refuse_seen_houses(runs, models)
+    rule = None if heuristic is None else read_heuristic(Path(heuristic), runs, allow_seen_houses)
+    fitted_on, folder = [str(path) for path in fit or ()], None if detector is None else Path(detector)
+    plain = baseline_methods(baselines, fitted_on, runs, folder, rule, allow_seen_houses, json)
+    methods = [*plain.baselines, *models]
+    if not methods:
         fix = "Name a checkpoint, or omit --baselines"
         raise InputError("datagen evaluate", "PATH", "no model or baseline given", fix)
-    gathered = score_runs(opened, evaluated, seed, json, n_examples=4)
-    report = evaluation_report(gathered, baseline_set, models, opened, sets, fit, bootstrap, seed, error)
-    if html is not None:
-        from datagen.evaluation_report.page import page_of
+    gathered = score_runs(runs, methods, json, n_examples=4)
+    columns, seen = gathered.columns, plain.houses.union(*(model.houses for model in models))
+    parts = parts_by_houses(columns, seen, candidate_sets_of(runs))
+    report = evaluation_report(gathered, methods, runs, parts, fitted_on, plain.left_out, arrivals)
+    if closed_loop:
+        from datagen.evaluation.arrival_outcomes import PLAN, SIM, make_all
+        from datagen.evaluation.closed_loop import loop_record, plan_loop
+        from datagen.train.training.launching import interruptible
 
-        with whole_file(html, alone=True) as file:
-            file.write(page_of(report, gathered).encode())
+        kept, mode = files[0].with_suffix(".arrivals"), SIM if execute else PLAN
+        judged = [method.method for method in methods]
+        loop = plan_loop(columns, runs, given, judged, arrivals, closed_loop, mode, str(kept))
+        processes = len(os.sched_getaffinity(0)) if workers is None else workers
+        with interruptible() as stopping:
+            if not make_all(loop.tasks, processes, stopping, json):
+                print_interrupted("; finished arrivals are kept", sys.argv[1:])
+                raise KeyboardInterrupt
+        report["closed_loop"] = loop_record(loop, judged)
+    write_report(report, gathered, files)
     return report
+
+
+def _refuse_bad_loop(scenes: int, execute: bool, workers: int | None, files: Sequence[Path]) -> None:
+    from datagen.configuration.specify import refuse_missing_packages
+
+    for option, value, least, most in (
+        ("--closed-loop", scenes, 1, 10**9),
+        ("--workers", workers or 0, 0, _MOST_WORKERS),
+    ):
+        if not least <= value <= most:
+            raise InputError(option, str(value), f"is not from {least} to {most:,}", "Give another number")
+    if not files:
+        fix = "Give --out FILE.html: its outcomes are kept in a folder next to it"
+        raise InputError("--closed-loop", "--out", "is missing", fix)
+    refuse_missing_packages("sim" if execute else "plan")

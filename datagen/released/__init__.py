@@ -9,7 +9,7 @@ from datagen.schemas.errors import InputError
 
 RELEASED = "released"
 FOLDER = Path(str(files("datagen.released")))
-CHECKPOINT, RESULTS, FRAME = "model.safetensors", "results.json", "frame"
+CHECKPOINT, FRAME = "model.safetensors", "frame"
 # The facts, how the model was made, and the page of both.
 CARD, RECIPE, CARD_PAGE = "card.json", "recipe.md", "MODEL_CARD.md"
 # The click (a pixel on the blue cup) and the robot of `datagen predict --demo` on the sample frame.

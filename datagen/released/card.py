@@ -33,7 +33,7 @@ def card_text(card: Facts, recipe: str) -> str:
     return "\n".join(
         [
             "# The released model\n",
-            "`card.json` has the same facts, `results.json` all results (`scripts/release_model.py`).\n",
+            "`card.json` has the same facts (`scripts/release_model.py`).\n",
             _about(card),
             _metrics(card),
             _demo(card["demo"]),

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from datagen.train.evaluation.bootstrap import LEVEL, Estimate, resample_weights, summed
-from datagen.train.evaluation.metrics import accuracy, balanced_accuracy, confusion, ratio
+from datagen.train.bootstrap import LEVEL, Estimate, resample_weights, summed
 from datagen.train.inputs import F64, Bools, Ints
+from datagen.train.metrics import accuracy, balanced_accuracy, confusion, ratio
 
 RESAMPLES = 1000
 _BLOCK = 100  # resamples at a time, which bounds memory

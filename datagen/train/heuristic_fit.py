@@ -11,9 +11,9 @@ from scipy.optimize import differential_evolution
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import HeuristicParams
-from datagen.train.evaluation.bootstrap import Estimate, resample_weights, summed
-from datagen.train.evaluation.metrics import accuracy, balanced_accuracy, confusion
+from datagen.train.bootstrap import Estimate, resample_weights, summed
 from datagen.train.inputs import F32, F64, I64, Array, Bools
+from datagen.train.metrics import accuracy, balanced_accuracy, confusion
 from datagen.workers.labels.distance_visibility_score import effective_distance, heuristic, visibility_score
 
 Form = Literal["planar", "planar-over-reach", "mount-over-reach"]

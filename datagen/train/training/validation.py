@@ -11,8 +11,8 @@ from torch import Tensor
 from typing_extensions import TypedDict  # pydantic reads typing's from Python 3.12 on
 
 from datagen.schemas.errors import InputError
-from datagen.train.evaluation.metrics import accuracy, area_under_roc, balanced_accuracy, confusion
 from datagen.train.inputs import F64, Array, Batch
+from datagen.train.metrics import accuracy, area_under_roc, balanced_accuracy, confusion
 from datagen.train.models import Model
 from datagen.train.rates import label_losses, success_shares
 from datagen.train.tensors import to_torch

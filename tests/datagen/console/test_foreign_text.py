@@ -8,7 +8,7 @@ import pytest
 
 from datagen import cli
 from datagen.console.printing import print_lines, print_rows
-from datagen.evaluation_report.page import escape
+from datagen.display.html_page import escape
 from datagen.schemas.jobs import JobRecord, Jobs, JobState
 from datagen.schemas.lineage import LINEAGE, ShardOrigin, encode_lineage
 from datagen.schemas.run_records import LedgerEntry, QuarantineRecord

@@ -1,1 +1,0 @@
-"""The frozen benchmark: reproducible runs, and one evaluation of every method on them."""

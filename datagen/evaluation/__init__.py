@@ -1,0 +1,1 @@
+"""Evaluation of methods on trials: metrics, intervals, closed loop, benchmark and report."""

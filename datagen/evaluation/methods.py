@@ -1,0 +1,326 @@
+"""The methods that are evaluated: models by their checkpoints, fitted baselines, and files of scores."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from datagen.configuration.toml_files import first_of, read_toml
+from datagen.display.progress import counting, steps
+from datagen.evaluation.columns import Gathered, gather
+from datagen.evaluation.comparisons import NO_TRAINING, Method, TrainedBy
+from datagen.evaluation.runs import EvaluatedRun, refuse_no_trials, stream_of
+from datagen.evaluation.score_files import ScoreFile, read_scores
+from datagen.released import RELEASED, released_checkpoint
+from datagen.schemas.errors import InputError
+from datagen.schemas.identity import digest_of
+from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.specification import HeuristicParams
+from datagen.train.baselines import BASELINES, fit_baselines, make_baselines
+from datagen.train.baselines.calibration import Calibration, calibrate
+from datagen.train.baselines.scalars import Scalars
+from datagen.train.scorers import ModelScorer, Scorer, weights_sha256
+from datagen.train.splits import refuse_shared_houses
+from datagen.workers.extras import EXTRAS, how_to_get
+
+if TYPE_CHECKING:
+    from datagen.train.training.checkpoints import CheckpointHead
+
+NONE = "none"
+# Seed of resamples, example scenes, arrivals and fitted baselines.
+SEED = 0
+# Training regime of a checkpoint's stage: stage 2 is the second of two stages.
+REGIMES = {"stage1": "stage1", "sim-only": "sim-only", "stage2": "two-stage"}
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluatedMethod:
+    """One method and its origin.
+
+    Models have a path and a checkpoint. Baselines have a state and, if they are fitted, a calibration. `note`
+    is printed with the method's name.
+    """
+
+    name: str
+    scorer: Scorer
+    place: str = ""
+    head: CheckpointHead | None = None
+    state: Mapping[str, Any] = field(default_factory=dict)
+    note: str = ""
+    calibration: Calibration | None = None
+
+    @property
+    def regime(self) -> str:
+        """Training regime of a model; "" for a baseline."""
+        return REGIMES.get(self.head.stage, self.head.stage) if self.head else ""
+
+    @property
+    def origin(self) -> TrainedBy:
+        """Key of the training, to compare models that differ in one part of it."""
+        if self.head is None:
+            return NO_TRAINING
+        return TrainedBy(self.regime, self.head.model, house_share(self.head))
+
+    @property
+    def recipe(self) -> str:
+        """Digest of a training without its seed; "" for baselines and for checkpoints that do not tell it."""
+        head = self.head
+        if head is None or "seed" not in head.options:
+            return ""
+        told = {k: getattr(head, k) for k in ("model", "model_config", "stage", "house_ids", "val_house_ids")}
+        told["options"] = {k: v for k, v in head.options.items() if k != "seed"}
+        told["samples"] = [origin["samples_sha256"] for origin in (*head.data, *head.val_data)]
+        if head.init:  # the stage 1 of each seed is another
+            told["init"] = head.init["stage" if head.init["stage"] == "stage1" else "digest"]
+        return digest_of(told)
+
+    @property
+    def method(self) -> Method:
+        """The method for the metrics."""
+        is_probability = isinstance(self.scorer, (ModelScorer, Scalars)) or (
+            isinstance(self.scorer, ScoreFile) and self.scorer.gives_probabilities
+        )
+        return Method(
+            self.name, self.scorer.threshold, self.origin, is_probability, self.calibration, self.recipe
+        )
+
+    @property
+    def houses(self) -> frozenset[str]:
+        """Houses of its training and validation."""
+        return frozenset(self.head.house_ids + self.head.val_house_ids) if self.head else frozenset()
+
+    @property
+    def objects(self) -> frozenset[str]:
+        """Digests of the objects of its training."""
+        return frozenset(self.head.object_digests) if self.head else frozenset()
+
+    def record(self) -> dict[str, Any]:
+        """Its entry in the report; a checkpoint is named by its file name and its digests."""
+        base = {
+            "name": self.name,
+            "regime": self.regime or None,
+            "threshold": None if self.method.only_picks else self.scorer.threshold,
+            "note": self.note or None,
+        }
+        if self.head is None:
+            return {**base, "checkpoint": None, "state": dict(self.state)}
+        assert isinstance(self.scorer, ModelScorer)
+        kept = ("model", "stage", "data", "best_epoch", "finished", "cost", "init")
+        checkpoint = {
+            "file": Path(self.place).name,
+            "sha256": self.head.digest,
+            "weights_sha256": weights_sha256(self.scorer.model),
+            "config": self.head.model_config,
+            **{name: getattr(self.head, name) for name in kept},
+        }
+        return {**base, "checkpoint": checkpoint}
+
+
+@dataclass(frozen=True, eq=False)
+class BaselineMethods:
+    """Baselines in their order, those omitted with the reason, and the houses they were fitted on."""
+
+    baselines: tuple[EvaluatedMethod, ...]
+    left_out: dict[str, str]
+    houses: frozenset[str]
+
+
+def read_heuristic(path: Path, runs: Sequence[EvaluatedRun], allow_seen_houses: bool) -> HeuristicParams:
+    """The rule of a file of `datagen calibrate`. InputError where it was fitted on one of `runs`."""
+    fix = "Give a file of `datagen calibrate`"
+    section = read_toml(path, fix).get("heuristic")
+    if not isinstance(section, dict):
+        raise InputError(path, "heuristic", "is missing", fix)
+    fitted_to = set(re.findall(r"^# run ([0-9a-f]{64}):", path.read_text(encoding="utf-8"), re.MULTILINE))
+    for run in runs:
+        if not allow_seen_houses and any(spec.hash() in fitted_to for spec in run.specs):
+            problem = f"was fitted on the labels of {run.place}"
+            raise InputError(path, "heuristic", problem, "Calibrate on runs of another split")
+    try:
+        return HeuristicParams.model_validate(section)
+    except ValidationError as error:
+        raise first_of(error, str(path), "heuristic") from None
+
+
+def baseline_methods(
+    requested: Sequence[str] | None,
+    fit: Sequence[str],
+    runs: Sequence[EvaluatedRun],
+    detector: Path | None = None,
+    heuristic: HeuristicParams | None = None,
+    allow_seen_houses: bool = False,
+    json: bool = False,
+) -> BaselineMethods:
+    """Return the requested baselines; for None all, except those that need --fit where `fit` is empty.
+
+    InputError where a requested one is not available, or where `fit` and `runs` share a house.
+    """
+    if requested and NONE in requested:
+        if len(requested) > 1:
+            raise InputError("--baselines", NONE, "is given with others", "Give only none, or omit it")
+        return BaselineMethods((), {}, frozenset())
+    names = list(dict.fromkeys(requested or BASELINES))
+    left_out: dict[str, str] = {}
+    if not requested and EXTRAS["sim"].missing():
+        names.remove("reachability")
+        left_out["reachability"] = f"needs the robots' files. {how_to_get('sim')}"
+    specs = [spec for run in runs for spec in run.specs]
+    specs += [run.manifest.spec for path in fit for run in open_runs(path)]
+    robots = tuple(dict.fromkeys(spec.arm.robot for spec in specs if spec.arm is not None))
+    made = make_baselines(names, detector, heuristic, SEED, robots)
+    calibrations: dict[str, Calibration] = {}
+    houses: frozenset[str] = frozenset()
+    if fit:
+        for path in fit:
+            refuse_no_trials(path)
+        stream = stream_of(fit)
+        if not allow_seen_houses:
+            for run in runs:
+                refuse_shared_houses(stream, run.stream)
+        houses = frozenset(stream.house_ids())
+        batches = list(stream.epoch(0))
+        with steps("baselines fitted", len(made), json) as step:
+            for k, baseline in enumerate(made):
+                (made[k],) = fit_baselines([baseline], batches)
+                calibrations[made[k].name] = calibrate(made[k], batches)
+                step()
+    else:
+        why = "needs runs to fit its parameters on (--fit)"
+        unfitted = {name: why for name, b in zip(names, made, strict=True) if b.needs_fit}
+        left_out |= unfitted
+        if requested and unfitted:
+            name = next(iter(unfitted))
+            raise InputError("--baselines", name, why, "Name runs in validation houses with --fit")
+        made = [b for b in made if not b.needs_fit]
+    # The note of a method follows its name in brackets.
+    named = [(b, *b.name.partition(" (")[::2]) for b in made]
+    return BaselineMethods(
+        tuple(
+            EvaluatedMethod(
+                name, b, state=b.state(), note=note.rstrip(")"), calibration=calibrations.get(b.name)
+            )
+            for b, name, note in named
+        ),
+        left_out,
+        houses,
+    )
+
+
+def open_models(paths: Sequence[str]) -> list[EvaluatedMethod]:
+    """The models of these checkpoints, with unique names by regime; the released one has its own."""
+    if not paths:
+        return []
+    from datagen.train.training.checkpoints import load_model
+
+    loaded = [(path, *load_model(path)) for path in paths]
+    released = str(released_checkpoint())
+    names = _names(
+        [(RELEASED if path == released else _regime_name(head), head.model) for path, _, head in loaded]
+    )
+    by_digest: dict[str, str] = {}
+    for path, _, head in loaded:
+        if head.digest in by_digest:
+            raise InputError(path, "", f"is the same checkpoint as {by_digest[head.digest]}", "Name it once")
+        by_digest[head.digest] = path
+    return [
+        EvaluatedMethod(name, ModelScorer(model, name, only_clear=True), path, head)
+        for (path, model, head), name in zip(loaded, names, strict=True)
+    ]
+
+
+def open_methods(
+    named: Sequence[str], fit: Sequence[str], runs: Sequence[EvaluatedRun], json: bool
+) -> list[EvaluatedMethod]:
+    """Checkpoints, baselines and files of scores, in the order in which they are named.
+
+    InputError for an unknown method, for two methods of one name, and where `fit` and `runs` share a house.
+    """
+    kinds = {each: _kind(each) for each in named}
+    checkpoints = [each for each, kind in kinds.items() if kind == "checkpoint"]
+    paths = [str(released_checkpoint()) if each == RELEASED else each for each in checkpoints]
+    found = {
+        each: replace(model, name=each if each == RELEASED else Path(each).stem)
+        for each, model in zip(checkpoints, open_models(paths), strict=True)
+    }
+    if baselines := [each for each, kind in kinds.items() if kind == "baseline"]:
+        made = baseline_methods(baselines, fit, runs, json=json)
+        found |= dict(zip(baselines, made.baselines, strict=True))
+    files = {each: read_scores(Path(each)) for each, kind in kinds.items() if kind == "scores"}
+    found |= {each: EvaluatedMethod(f.name, f, note="scores of a file") for each, f in files.items()}
+    methods = [found[each] for each in kinds]
+    for name, count in Counter(method.name for method in methods).items():
+        if count > 1:
+            raise InputError("METHOD", name, "is the name of two methods", "Rename one of the files")
+    return methods
+
+
+def _kind(named: str) -> str:
+    path = Path(named)
+    if named in BASELINES:
+        return "baseline"
+    if named == RELEASED or path.is_file():
+        return "scores" if path.suffix.lower() == ".csv" else "checkpoint"
+    fix = f"Give {RELEASED}, a checkpoint, a file of scores (.csv), or a baseline: {', '.join(BASELINES)}"
+    raise InputError("METHOD", named, "is no file and no baseline", fix)
+
+
+def refuse_seen_houses(
+    runs: Sequence[EvaluatedRun],
+    evaluated: Iterable[EvaluatedMethod],
+    fix: str = "Evaluate a run of another split, or give --allow-seen-houses to report them separately",
+) -> None:
+    """Raise InputError that names a house of these runs on which a method was trained."""
+    for run in runs:
+        here = run.stream.house_ids()
+        for method in evaluated:
+            if shared := sorted(here & method.houses):
+                problem = f"{method.name} ({method.place}) was trained on {shared[0]!r}"
+                problem += f" and {len(shared) - 1} more of its houses" if len(shared) > 1 else ""
+                raise InputError(run.place, "house_id", problem, fix)
+
+
+def score_runs(
+    runs: Sequence[EvaluatedRun], methods: Sequence[EvaluatedMethod], json: bool, n_examples: int = 0
+) -> Gathered:
+    """The columns of all runs in stored order, and `n_examples` scenes to show, with progress."""
+    with counting("scenes", json) as seen:
+        total, done = sum(run.stream.n_scenes for run in runs), 0
+
+        def step(scenes: int) -> None:
+            nonlocal done
+            done += scenes
+            seen(done, total)
+
+        batches = [(run.cells, run.stream.epoch(0)) for run in runs]
+        rng = np.random.default_rng([SEED, 0])
+        return gather(batches, {m.name: m.scorer for m in methods}, rng, n_examples, step)
+
+
+def house_share(head: CheckpointHead) -> float:
+    """Share of the available houses that the model was trained on."""
+    share = head.options.get("house_share", 1.0)
+    return float(share) if isinstance(share, (int, float)) else 1.0
+
+
+def _regime_name(head: CheckpointHead) -> str:
+    regime, share = REGIMES.get(head.stage, head.stage), house_share(head)
+    return regime if share == 1 else f"{regime} {share:.0%}"
+
+
+def _names(known: Sequence[tuple[str, str]]) -> list[str]:
+    """A name for each (regime, model): the regime alone, with the model, or with a number as well."""
+    regimes, both = Counter(regime for regime, _ in known), Counter(known)
+    numbers: Counter[tuple[str, str]] = Counter()
+    names: list[str] = []
+    for regime, model in known:
+        numbers[regime, model] += 1
+        name = regime if regimes[regime] == 1 else f"{regime} {model}"
+        names.append(name if both[regime, model] == 1 else f"{name} {numbers[regime, model]}")
+    return names

@@ -1,0 +1,332 @@
+"""The tables of an evaluation, and their numbers as text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from datagen.evaluation.closed_loop import AT_RANDOM, BY_LABELS
+from datagen.evaluation.grids import HARD_SHARE, PICKS
+
+Report = Mapping[str, Any]
+DECISIONS = ("accuracy", "balanced_accuracy", "area_under_roc")
+CHOICE = ("best_pick", "mean_average_precision")
+METRIC_WORDS = {
+    "accuracy": "accuracy",
+    "balanced_accuracy": "balanced accuracy",
+    "area_under_roc": "AUC",
+    "best_pick": "best choice positive",
+    "good": "positive choices",
+    "mean_average_precision": "mAP",
+    "smoothed": "success",
+}
+_SET_WORDS = {
+    "in-range": "clear and within reach",
+    "clear": "clear",
+    "grid": "all cells; methods know where the base collides",
+}
+_TRIALS = {
+    "plan": "arrives off its pick and plans from there",
+    "sim": "arrives off its pick, plans from there and executes in a disturbed world",
+}
+_FAILURES_AT_M = 0.1
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with its title; a `detail` is folded on the page and left out of the terminal."""
+
+    title: str
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    detail: bool = False
+
+
+def set_tables(report: Report, scores: Report) -> Iterator[Table]:
+    """The tables of one candidate set: methods, differences, reach, choices, and groups of candidates."""
+    yield _accuracy(report, scores)
+    yield from comparison_tables(scores["comparisons"], scores["candidates"])
+    if scores["out_of_reach"]["count"]:
+        yield _reach(report, scores)
+    yield _choice(report, scores)
+    yield from _breakdown(report, scores)
+
+
+def _accuracy(report: Report, scores: Report) -> Table:
+    """Table I: decisions and calibration of every method, the paper's accuracy, and the base rate."""
+    share = scores["positives"] / scores["count"]
+    of_methods = [(_label(r), scores["methods"][r["name"]], _paper(r, report)) for r in report["methods"]]
+    of_means = [(mean["name"], mean, None) for mean in scores["means"]]
+    rows = [
+        (
+            name,
+            *(with_interval(values[metric]) for metric in DECISIONS),
+            percent(values.get("expected_calibration_error")),
+            percent(paper),
+        )
+        for name, values, paper in (*of_methods, *of_means)
+    ]
+    rows.append(("the commoner label", percent(max(share, 1 - share)), "50.0", "50.0", "-", "-"))
+    words = f"{scores['count']:,} candidates of {scores['scenes']:,} scenes, {percent(share)}% positive"
+    heads = ("method", *(f"{METRIC_WORDS[m]} (%)" for m in DECISIONS), "calibration error (%)", "paper (%)")
+    return Table(f"Table I: {_SET_WORDS[scores['candidates']]}; {words}", heads, rows)
+
+
+def comparison_tables(comparisons: Sequence[Report], where: str) -> Iterator[Table]:
+    """Paired differences of regimes and of the best model and baseline; in detail, all others."""
+    for title, detail in (
+        ("paired differences: regimes, and best model - best baseline", False),
+        ("further paired differences", True),
+    ):
+        rows = [
+            (
+                f"{d['first']} - {d['second']}",
+                METRIC_WORDS[d["metric"]],
+                with_interval(d, signed=True),
+                d["verdict"] if d["verdict"] != "open" else "not significant",
+            )
+            for d in comparisons
+            if (d["kind"] == "other") is detail
+        ]
+        yield Table(f"{title} ({where})", ("difference", "by", "points", "verdict"), rows, detail)
+
+
+def _reach(report: Report, scores: Report) -> Table:
+    """Table II: accuracy within and beyond reach."""
+    rows = [
+        (
+            _label(record),
+            with_interval(scores["methods"][record["name"]]["accuracy_in_reach"]),
+            with_interval(scores["methods"][record["name"]]["accuracy_out_of_reach"]),
+            percent(_paper(record, report)) if record["regime"] else "-",
+            percent(report["paper"]["accuracy_out_of_reach"]) if record["regime"] == "two-stage" else "-",
+        )
+        for record in models_first(report["methods"])
+    ]
+    inside, outside = scores["in_reach"]["count"], scores["out_of_reach"]["count"]
+    title = f"Table II: {scores['candidates']}, {inside:,} within reach and {outside:,} beyond"
+    return Table(
+        title, ("method", "within reach (%)", "beyond (%)", "paper, all (%)", "paper, beyond (%)"), rows
+    )
+
+
+def _choice(report: Report, scores: Report) -> Table:
+    rows = [
+        (record["name"], *(with_interval(scores["methods"][record["name"]][metric]) for metric in CHOICE))
+        for record in report["methods"]
+    ]
+    heads = ("method", *(f"{METRIC_WORDS[metric]} (%)" for metric in CHOICE))
+    return Table(f"choosing among a robot's candidates ({scores['candidates']})", heads, rows)
+
+
+def _breakdown(report: Report, scores: Report) -> Iterator[Table]:
+    names = [record["name"] for record in models_first(report["methods"])]
+    for heading in dict.fromkeys(row["by"] for row in scores["breakdown"]):
+        rows = [
+            (
+                row["group"],
+                f"{row['count']:,}",
+                percent(row["positives"] / row["count"]),
+                *(percent(row["methods"][name]["accuracy"]) for name in names),
+            )
+            for row in scores["breakdown"]
+            if row["by"] == heading
+        ]
+        title = f"accuracy by {heading} ({scores['candidates']}), in %"
+        yield Table(title, (heading, "count", "good (%)", *names), rows, detail=True)
+
+
+def grid_tables(report: Report, grids: Report) -> Iterator[Table]:
+    """Table III, picks and the order of a grid's cells, with their comparisons and success on arrival."""
+    methods = [(r["name"], grids["methods"][r["name"]], f"{r['seconds_per_600']:.2g}")
+               for r in models_first(report["methods"])]  # fmt: skip
+    rows = [
+        (
+            name,
+            with_interval(values["good"]),
+            _metres(values["missed_m"]),
+            with_interval(values["mean_average_precision"]),
+            time_s,
+        )
+        for name, values, time_s in (*methods, *((mean["name"], mean, "-") for mean in grids["means"]))
+    ]
+    paper, chance = report["paper"], percent(grids["any_clear"])
+    paper_values = (percent(paper["grid_selection"]), f"{paper['grid_miss_m']:.2f}", "-")
+    rows.append(("any clear candidate", chance, "-", chance, "-"))
+    rows.append(("paper, two-stage", *paper_values, f"{paper['seconds_per_600']:g}"))
+    without = grids["scenes_without_positive"]
+    title = (
+        f"Table III: {grids['scenes'] - without:,} whole grids with a positive candidate, {without:,} without"
+    )
+    yield Table(title, ("method", "choice positive (%)", "else missed by (m)", "mAP (%)", "600 in (s)"), rows)
+    yield from comparison_tables(grids["comparisons"], "whole grids")
+    if grids["arrivals"]:
+        yield _arrivals(report, grids["arrivals"])
+
+
+def _arrivals(report: Report, found: Sequence[Report]) -> Table:
+    rows = [
+        (
+            record["name"] if pick == "nominal" else "",
+            pick,
+            *(percent(row["methods"][record["name"]][pick]["value"]) for row in found),
+        )
+        for record in models_first(report["methods"])
+        for pick in PICKS
+    ]
+    rows += [(f"{key} clear candidate", "", *(percent(row[key]) for row in found)) for key in ("best", "any")]
+    title = "success (%) where the robot parks off the pick, in any direction; smoothed by that error"
+    return Table(title, ("method", "pick", *(row["arrival"] for row in found)), rows)
+
+
+def loop_tables(report: Report) -> Iterator[Table]:
+    """The tables of the closed loop: success, gain of smoothing, best methods, causes, and agreement."""
+    loop = report["closed_loop"]
+    names = [method["name"] for method in models_first(report["methods"])] + [BY_LABELS, AT_RANDOM]
+    for part in loop["parts"]:
+        rows = [
+            (name if k == 0 else "", pick if len(picks) == len(PICKS) else "",
+             *(with_interval(row["methods"][name][pick], digits=0) for row in part["table"]))
+            for name in names
+            for picks in [part["table"][0]["methods"][name]]
+            for k, pick in enumerate(picks)
+        ]  # fmt: skip
+        title = f"success (%) in {part['scenes']} scenes: the robot {_TRIALS[loop['mode']]}"
+        if part["scenes_of"] == "hard":
+            title = (
+                f"the same in {part['scenes']} scenes with at most {loop['hard_share']:.0%} good clear cells"
+            )
+        errors = [row["arrival"].removesuffix(" off") for row in part["table"]]
+        yield Table(title, ("method", "pick", *errors), rows)
+    whole = loop["parts"][0]["table"]
+    errors = [row["arrival"].removesuffix(" off") for row in whole]
+    gains = [
+        (name, *(with_interval(row["gains"][name], signed=True, digits=0) for row in whole))
+        for name in whole[0]["gains"]
+    ]
+    yield Table("points that smoothing gains", ("method", *errors), gains)
+    best = [
+        (row["arrival"], f"{d['first']} - {d['second']}", with_interval(d, signed=True), d["verdict"])
+        for row in whole
+        for d in row["comparisons"]
+        if d["kind"] == "best"
+    ]
+    heads = ("arrival", "difference", "points", "verdict")
+    yield Table("best model - best baseline, smoothed picks", heads, best)
+    row = min(whole, key=lambda row: abs(row["distance_m"] - _FAILURES_AT_M))
+    causes = [
+        (name, pick, ", ".join(f"{cause} {percent(share)}" for cause, share in result["failures"].items()))
+        for name in names
+        for pick, result in row["methods"][name].items()
+    ]
+    yield Table(f"failures (% of arrivals, {row['arrival']})", ("method", "pick", "cause"), causes)
+    shares = {
+        "success": "success (%)",
+        "nearest_label": "by nearest label (%)",
+        "bilinear_label": "between labels (%)",
+        "agree_with_nearest": "agree with nearest (%)",
+    }
+    agreement = [
+        (row["arrival"], f"{row['distinct']:,}", *(percent(row[key]) for key in shares))
+        for row in loop["agreement"]
+    ]
+    title = "agreement with the labels around each arrival"
+    yield Table(title, ("arrival", "distinct arrivals", *shares.values()), agreement, detail=True)
+
+
+def source_tables(report: Report) -> Iterator[Table]:
+    """The runs and checkpoints behind the numbers."""
+    runs = [
+        (run["place"], part["label_source"], part["split"], part["candidates"], str(part["per_scene"]),
+         part["spec_hash"])
+        for run in report["runs"] for part in run["parts"]
+    ]  # fmt: skip
+    heads = ("run", "labels", "split", "candidates", "candidates per scene", "specification")
+    yield Table("runs", heads, runs, detail=True)
+    checkpoints = [
+        (record["name"], checkpoint["file"], checkpoint["model"], checkpoint["sha256"])
+        for record in report["methods"]
+        if (checkpoint := record["checkpoint"])
+    ]
+    yield Table("checkpoints", ("method", "file", "model", "sha256"), checkpoints, detail=True)
+
+
+def notes(report: Report) -> list[tuple[str, str]]:
+    """Return the notes on the numbers: (subject, note)."""
+    boot = report["bootstrap"]
+    method = f"{100 * boot['level']:g}% by {boot['resamples']:,} resamples of scenes, seed {boot['seed']}"
+    found = [
+        *_benchmark_notes(report.get("benchmark")),
+        ("intervals", method),
+        ("clearance", "every method knows where the base is clear, and predicts negative elsewhere"),
+        ("paper", f"{report['paper']['source']}: other houses, arms and candidates"),
+    ]
+    if any(table["means"] for part in report["parts"] for table in (*part["sets"].values(),)):
+        found.append(
+            ("means", "over trainings that differ by their seed alone; their intervals hold seeds too")
+        )
+    if any(record["threshold"] is None for record in report["methods"]):
+        found.append(("*", "has no threshold: its choice for each robot is positive, the rest negative"))
+    if report["fitted_on"]:
+        found.append(("baselines", f"fitted on {', '.join(report['fitted_on'])}"))
+    if loop := report.get("closed_loop"):
+        count = loop["arrivals"]
+        found += [
+            ("arrivals", f"{loop['arrivals_per_scene']} a scene and error, the same for all methods; "
+                         f"{count['wanted']:,} in all, {count['distinct']:,} of them distinct"),
+            ("closed loop", f"leaves out {loop['scenes_without_good']} grids without a good clear cell"),
+        ]  # fmt: skip
+    found += [(record["name"], record["note"]) for record in report["methods"] if record["note"]]
+    return found + [(name, f"omitted: {why}") for name, why in report["left_out"].items()]
+
+
+def _benchmark_notes(benchmark: Report | None) -> Iterator[tuple[str, str]]:
+    if benchmark is None:
+        return
+    yield "benchmark", f"version {benchmark['version']}, {benchmark['digest'][:12]}"
+    for name, run in benchmark["runs"].items():
+        digests = run["digests"]
+        frozen = (
+            f"candidates {digests['candidates'][:12]}, labels {digests['labels'][:12]}"
+            if digests
+            else "not frozen: its candidates and labels were not compared"
+        )
+        yield f"run {name}", f"{run['about']}; specification {run['spec_hash'][:12]}, {frozen}"
+    yield "grids", f"mixed: good and bad clear cells; hard: at most {HARD_SHARE:.0%} of the clear cells good"
+    if benchmark["not_scored"]:
+        yield "not scored", f"{', '.join(benchmark['not_scored'])}: every row is incomplete"
+
+
+def percent(value: float | None, signed: bool = False, digits: int = 1) -> str:
+    """0.8413 as 84.1, or +84.1."""
+    return "-" if value is None else f"{100 * value:{'+' if signed else ''}.{digits}f}"
+
+
+def with_interval(estimate: Report, signed: bool = False, digits: int = 1) -> str:
+    """Percent with its interval: 84.1 [82.0, 86.2]."""
+    value, low, high = (percent(estimate[k], signed, digits) for k in ("value", "low", "high"))
+    return value if estimate["value"] is None or estimate["low"] is None else f"{value} [{low}, {high}]"
+
+
+def _metres(estimate: Report) -> str:
+    """Metres with their interval: 0.24 [0.20, 0.31]."""
+    if estimate["value"] is None:
+        return "-"
+    low, high = (f"{e:.2f}" if (e := estimate[k]) is not None else "-" for k in ("low", "high"))
+    return f"{estimate['value']:.2f} [{low}, {high}]"
+
+
+def _label(record: Report) -> str:
+    """A method's name, with * where it has no threshold."""
+    return record["name"] + (" *" if record["threshold"] is None else "")
+
+
+def _paper(record: Report, report: Report) -> float | None:
+    """The paper's accuracy of the same method or regime, if there is one."""
+    return report["paper"]["accuracy"].get(record["regime"] or record["name"])
+
+
+def models_first(records: Sequence[Report]) -> list[Report]:
+    """Methods, models before baselines."""
+    return sorted(records, key=lambda record: record["regime"] is None)

@@ -1,0 +1,61 @@
+"""Columns of random candidates: metrics care for numbers, not for where they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from datagen.evaluation.columns import Columns
+from datagen.schemas.outcomes import OUTCOMES
+
+
+def make_columns(
+    rng: np.random.Generator,
+    n_scenes: int = 12,
+    per_scene: int = 20,
+    scores: Mapping[str, np.ndarray] | None = None,
+    positive_share: float = 0.3,
+) -> Columns:
+    """Scenes of one robot each; positives are clear and within reach, as simulated ones are."""
+    n = n_scenes * per_scene
+    scene = np.repeat(np.arange(n_scenes), per_scene)
+    is_clear = rng.random(n) < 0.7
+    mount_m = rng.uniform(0, 1.5, n).astype(np.float32)
+    reach_m = np.repeat(rng.uniform(0.5, 1.0, n_scenes).astype(np.float32), per_scene)
+    label = (rng.random(n) < positive_share) & is_clear & (mount_m <= reach_m)
+    return Columns(
+        scene=scene,
+        robot=scene.copy(),
+        label=label,
+        is_clear=is_clear,
+        outcome=np.where(label, 0, rng.integers(1, len(OUTCOMES), n)).astype(np.uint8),
+        base_xy_m=rng.uniform(-1, 1, (n, 2)).astype(np.float32),
+        distance_m=(mount_m * 0.9).astype(np.float32),
+        mount_distance_m=mount_m,
+        reach_m=reach_m,
+        visibility=rng.random(n).astype(np.float32),
+        scores=dict(scores) if scores is not None else {"random": rng.random(n)},
+        house=np.array([f"house-{k % 5}" for k in range(n_scenes)], object),
+        target=np.array([f"object-{k % 3}" for k in range(n_scenes)], object),
+        target_digest=np.array([f"{k % 3}" * 64 for k in range(n_scenes)], object),
+        run=np.zeros(n_scenes, np.int64),
+        is_grid=np.ones(n_scenes, np.bool_),
+    )
+
+
+def make_grids(label: np.ndarray, score: np.ndarray) -> Columns:
+    """Four equal grids, all clear, their cells in random order; label and score (N, N) with rows along y."""
+    rng, side = np.random.default_rng(0), len(label)
+    made = make_columns(rng, 4, side**2)
+    axis = np.linspace(-1, 1, side)
+    y, x = np.meshgrid(axis, axis, indexing="ij")
+    order = np.concatenate([rng.permutation(side**2) for _ in range(4)])
+    return replace(
+        made,
+        base_xy_m=np.stack([x.ravel(), y.ravel()], axis=1)[order].astype(np.float32),
+        label=label.ravel()[order].astype(bool),
+        is_clear=np.ones(len(made), bool),
+        scores={"model": score.ravel()[order]},
+    )

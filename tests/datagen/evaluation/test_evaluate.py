@@ -1,0 +1,262 @@
+"""`datagen evaluate` over real trials, with checkpoints of tiny models that learned nothing."""
+
+from __future__ import annotations
+
+import json
+import re
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from datagen import cli
+from datagen.evaluation.methods import open_models
+from datagen.train.models import build_model
+from datagen.train.training.checkpoints import Checkpoint, CheckpointHead, write_checkpoint
+from tests.made_runs import make_run
+from tests.sim_extra import needs_sim
+from tests.small_runs import CONFIG, arrays_of, json_of
+
+pytestmark = needs_sim
+
+SIDE, SCENES = 5, 6
+CELLS = SIDE * SIDE
+GRID = f"[candidates]\ngrid_cells = {SIDE}\narm_reach_m = {{low = 0.9, high = 1.0}}\n"
+FEW_GRASPS = "[arm.grasps]\nper_object = 40\nper_scene = 10\n"
+TINY = {
+    "n_points": 64, "tokens": [4, 4, 4], "scales_m": [0.1], "width": 4, "embedding": 8, "head": [8],
+}  # fmt: skip
+QUICK = ("--baselines", "none")
+
+
+@pytest.fixture(scope="module")
+def grids(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Whole grids, planned and executed; sealed, to be read by other means too."""
+    folder = tmp_path_factory.mktemp("grids")
+    (folder / "grid.toml").write_text(CONFIG + GRID + FEW_GRASPS)
+    where = ["--out", str(folder / "run"), "--config", str(folder / "grid.toml"), "--workers", "0"]
+    n = str(SCENES * CELLS)
+    assert cli.run(["submit", "sim", "--n", n, "--candidates-per-scene", "grid", *where]) == 0
+    return folder / "run"
+
+
+def checkpoint(path: Path, stage: str = "stage2", seed: int = 0, **said: Any) -> str:
+    torch.manual_seed(seed)
+    model = build_model("shared", TINY)
+    plain: dict[str, Any] = {
+        "options": {}, "data": (), "val_data": (), "house_ids": ("elsewhere",), "object_digests": (),
+        "val_house_ids": (), "cost": {}, "versions": {}, "history": (),
+    }  # fmt: skip
+    head = CheckpointHead(model="shared", model_config=model.config, stage=stage, **{**plain, **said})
+    write_checkpoint(path, Checkpoint(head, dict(model.state_dict())))
+    return str(path)
+
+
+class Page(HTMLParser):
+    """The tags of a page, and the addresses that it asks for."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.addresses += [v for k, v in attrs if k in ("src", "href", "xlink:href", "srcset") and v]
+
+
+def test_tables_equal_counts_of_the_run(
+    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = {"stage1": "a.pt", "sim-only": "b.pt", "stage2": "c.pt"}
+    files = [checkpoint(tmp_path / f, stage, seed) for seed, (stage, f) in enumerate(names.items())]
+    page = tmp_path / "page.html"
+    report = json_of(capsys, ["evaluate", *files, str(grids), *QUICK, "--out", str(page)])
+    stored = arrays_of(grids)
+    label, clear = stored["label"] == 1, stored["base_is_clear"]
+    (part,) = report["parts"]
+    assert part["title"] == "unseen houses" and part["left_out"] == {}
+    assert {m["name"]: m["regime"] for m in report["methods"]} == {
+        "stage1": "stage1", "sim-only": "sim-only", "two-stage": "two-stage",
+    }  # fmt: skip
+    assert all(len(m["checkpoint"]["sha256"]) == 64 for m in report["methods"])
+    counts = {name: (told["count"], told["positives"]) for name, told in part["sets"].items()}
+    in_range = clear & (stored["mount_distance_m"] <= stored["arm_reach_m"])
+    expected = {"in-range": in_range, "clear": clear, "grid": np.ones(len(label), np.bool_)}
+    assert counts == {k: (int(rows.sum()), int(label[rows].sum())) for k, rows in expected.items()}
+    # Every method knows where the base fits, and is right elsewhere.
+    rows = [
+        r for r in part["sets"]["grid"]["breakdown"] if (r["by"], r["group"]) == ("outcome", "base_collision")
+    ]
+    assert [row["count"] for row in rows] == [int((~clear).sum())] and (~clear).any()
+    assert all(told["accuracy"] == 1 for row in rows for told in row["methods"].values())
+    regimes = [("two-stage", "sim-only"), ("sim-only", "stage1")]
+    for told in (*part["sets"].values(), part["grids"]):
+        found = [(d["first"], d["second"]) for d in told["comparisons"] if d["kind"] == "regimes"]
+        assert list(dict.fromkeys(found)) == regimes
+    with_good = {int(s) for s in stored["sample_scene_index"][label]}
+    assert part["grids"]["scenes"] == SCENES
+    assert part["grids"]["scenes_without_positive"] == SCENES - len(with_good)
+    assert report["runs"][0]["parts"][0]["label_source"] == "sim"
+    assert page.stat().st_size < 3_000_000
+    _check_page(page.read_text(), n_sets=3)
+
+
+def test_a_candidate_set_is_reported_over_the_runs_that_cover_it(
+    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    near, file = tmp_path / "near", checkpoint(tmp_path / "c.pt")
+    drawn = ["--candidates", "in-range", "--candidates-per-scene", "4", "--n", "8", "--seed", "2"]
+    where = ["--out", str(near), "--config", str(grids.parent / "grid.toml"), "--workers", "0"]
+    assert cli.run(["submit", "sim", *drawn, *where]) == 0
+    (part,) = json_of(capsys, ["evaluate", file, str(near), str(grids), *QUICK])["parts"]
+    stored = arrays_of(grids)
+    clear = stored["base_is_clear"]
+    in_range = clear & (stored["mount_distance_m"] <= stored["arm_reach_m"])
+    told = {name: (said["runs"], said["count"], said["scenes"]) for name, said in part["sets"].items()}
+    scenes = {name: len(set(stored["sample_scene_index"][rows])) for name, rows in
+              (("in-range", in_range), ("clear", clear))}  # fmt: skip
+    assert told == {
+        "in-range": ([0, 1], int(in_range.sum()) + 8, scenes["in-range"] + 2),
+        "clear": ([1], int(clear.sum()), scenes["clear"]),
+        "grid": ([1], len(clear), SCENES),
+    }
+
+
+def _check_page(text: str, n_sets: int) -> None:
+    page = Page(text)
+    # Each set has intervals and curves, and there is one picture of grids; nothing is loaded from elsewhere.
+    pictures = re.findall(r"<svg.*?</svg>", text, re.DOTALL)
+    assert len(pictures) == 2 * n_sets + 1
+    for picture in pictures:
+        ET.fromstring(picture)
+    assert not {"script", "link", "iframe", "img"} & set(page.tags)
+    assert page.addresses and all(a.startswith(("#", "data:")) for a in page.addresses)
+    assert '<html lang="en">' in text and 'name="viewport"' in text and "prefers-color-scheme: dark" in text
+    assert "<title>Evaluation of base placement</title>" in text
+    assert (
+        text.count("<table") == text.count('<div class="scroll" tabindex="0"><table') > 0
+    )  # scroll on phones
+    for words in ("84.1", "94.7", "arXiv:2509.11594", "Table II:", "Table III:", "two-stage", "sha256"):
+        assert words in text, words
+
+
+def test_the_same_command_gives_the_same_numbers_as_json_and_as_tables(
+    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, out = checkpoint(tmp_path / "c.pt"), tmp_path / "report.json"
+    words = ["evaluate", str(grids), file, *QUICK]
+    first, second = json_of(capsys, [*words, "--out", str(out)]), json_of(capsys, words)
+    assert json.loads(out.read_text()) == first
+    for report in (first, second):
+        assert all(method.pop("seconds_per_600") > 0 for method in report["methods"])
+    assert first == second
+    assert cli.run(words) == 0
+    said = capsys.readouterr().out
+    accuracy = first["parts"][0]["sets"]["clear"]["methods"]["two-stage"]["accuracy"]
+    assert f"{100 * accuracy['value']:.1f} [{100 * accuracy['low']:.1f}, " in said
+    for line in ("Table I:", "Table II:", "Table III:", "mAP", "commoner label", "arXiv:2509.11594"):
+        assert line in said, line
+
+
+def test_houses_that_were_trained_on_are_refused_or_reported_separately(
+    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    houses, digests = arrays_of(grids)["house_id"], arrays_of(grids)["object_digest"]
+    house, count = str(houses[0]), int((houses == houses[0]).sum())
+    assert 0 < count < SCENES
+    clean = checkpoint(tmp_path / "clean.pt", "stage1", 1)
+    for k, field in enumerate(("house_ids", "val_house_ids")):
+        leaky = checkpoint(tmp_path / f"{k}.pt", **{field: (house,)})
+        assert cli.run(["evaluate", clean, leaky, str(grids), *QUICK]) == 2
+        error = capsys.readouterr().err
+        assert (
+            f"house_id: two-stage ({leaky}) was trained on '{house}'" in error
+            and "--allow-seen-houses" in error
+        )
+    leaky = checkpoint(tmp_path / "leaky.pt", house_ids=(house,), object_digests=(str(digests[0, 0]),))
+    words = ["evaluate", leaky, str(grids), *QUICK, "--allow-seen-houses"]
+    report = json_of(capsys, words)
+    assert [(part["title"], part["scenes"]) for part in report["parts"]] == [
+        ("unseen houses", SCENES - count), ("training houses", count),
+    ]  # fmt: skip
+    label = arrays_of(grids)["label"].reshape(SCENES, CELLS)
+    for part, scenes in zip(report["parts"], (houses != house, houses == house), strict=True):
+        if label[scenes].any():
+            rows = part["sets"]["grid"]["breakdown"]
+            known = sum(r["count"] for r in rows if (r["by"], r["group"]) == ("object trained on", "yes"))
+            assert known == CELLS * int((digests[scenes, 0] == digests[0, 0]).sum())
+        else:
+            assert {"grid", "whole grids"} <= part["left_out"].keys() and part["grids"] is None
+
+
+def test_baselines_are_fitted_only_in_other_houses(
+    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["evaluate", str(grids)]
+    report = json_of(capsys, words)
+    names = [method["name"] for method in report["methods"]]
+    assert names == ["proximity", "threshold", "threshold-visibility", "analytic", "reachability"]
+    assert set(report["left_out"]) == {"distance", "scalars"}
+    assert all("--fit" in why for why in report["left_out"].values())
+    stored = arrays_of(grids)
+    feasible = stored["base_is_clear"] & (stored["mount_distance_m"] <= stored["arm_reach_m"])
+    told = report["parts"][0]["sets"]["grid"]["methods"]
+    right = (feasible == (stored["label"] == 1)).mean()
+    assert told["threshold"]["accuracy"]["value"] == pytest.approx(right)
+    assert report["methods"][0]["threshold"] is None and report["methods"][2]["note"]
+    assert {d["kind"] for d in report["parts"][0]["sets"]["grid"]["comparisons"]} == {"other"}
+    assert cli.run([*words, "--fit", str(grids)]) == 2
+    assert "is also in the training data" in capsys.readouterr().err
+    rule = tmp_path / "rule.toml"
+    rule.write_text("[heuristic]\nmu = 0.5\ntau = 0.4\n")
+    chosen = ["--baselines", "distance", "--baselines", "analytic", "--heuristic", str(rule)]
+    report = json_of(capsys, [*words, "--fit", str(grids), "--allow-seen-houses", *chosen])
+    assert [part["title"] for part in report["parts"]] == ["training houses"]
+    distance, analytic = report["methods"]
+    rule.write_text(f"# run {report['runs'][0]['parts'][0]['spec_hash']}: sim\n[heuristic]\nmu = 0.5\n")
+    assert cli.run([*words, "--baselines", "analytic", "--heuristic", str(rule)]) == 2
+    assert "was fitted on the labels of" in capsys.readouterr().err
+    assert distance["state"] and analytic["state"]["params"]["mu"] == 0.5 and analytic["threshold"] < 0.45
+
+
+def test_models_of_one_regime_are_numbered(tmp_path: Path) -> None:
+    files = [checkpoint(tmp_path / f"{k}.pt", stage, k) for k, stage in enumerate(("stage2", "stage2", "x"))]
+    assert [c.scorer.name for c in open_models(files)] == ["two-stage shared 1", "two-stage shared 2", "x"]
+
+
+def test_bad_input_is_refused_in_one_line(
+    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, run = checkpoint(tmp_path / "c.pt"), str(grids)
+    (tmp_path / "thesis.tex").write_text("text")
+    odd = tmp_path / "odd.toml"
+    odd.write_text('[heuristic]\nmu = "far"\n')
+    heuristic = make_run(tmp_path / "heuristic").storage.url
+    cases: list[tuple[list[str], list[str]]] = [
+        ([file], ["PATH", "no run is given"]),
+        ([file, str(tmp_path / "none")], ["none", "neither a checkpoint file nor a run folder"]),
+        ([str(tmp_path / "thesis.tex"), run], ["thesis.tex", "not a datagen checkpoint"]),
+        ([file, heuristic], ["label_source: is heuristic", "datagen submit sim"]),
+        ([run, "--baselines", "none"], ["PATH", "no model or baseline given"]),
+        ([file, file, run], ["the same checkpoint as"]),
+        ([file, run, run], ["sample_id", "occurs twice"]),
+        ([file, run, "--baselines", "luck"], ["--baselines: luck: is not a baseline"]),
+        ([file, run, "--baselines", "scalars"], ["--baselines: scalars", "--fit"]),
+        ([file, run, "--fit", heuristic, "--baselines", "distance"], ["label_source: is heuristic"]),
+        ([file, run, "--heuristic", str(tmp_path / "thesis.tex"), *QUICK], ["thesis.tex", "is not TOML"]),
+        ([file, run, "--heuristic", str(odd), *QUICK], ["odd.toml: heuristic.mu", "given: far"]),
+        ([file, run, "--out", "page.pdf"], ["--out", "not a .json or .html file"]),
+        ([file, run, "--out", str(tmp_path / "no" / "page.html")], ["--out", "folder does not exist"]),
+        ([file, run, "--arrival", "ring:1"], ["--arrival: ring:1"]),
+    ]
+    for words, expected in cases:
+        more = [] if "--baselines" in words else ["--baselines", "none"]
+        assert cli.run(["evaluate", *words, *more]) == 2, words
+        said = capsys.readouterr().err.strip().splitlines()[-1]
+        assert said.startswith("error: ") and all(part in said for part in expected), (words, said)
