@@ -69,8 +69,8 @@ def _accuracy(report: Report, scores: Report) -> Table:
     ]
     rows.append(("the commoner label", percent(max(share, 1 - share)), "50.0", "50.0", "-", "-"))
     words = f"{scores['count']:,} candidates of {scores['scenes']:,} scenes, {percent(share)}% positive"
-    heads = ("method", *(f"{METRIC_WORDS[m]} (%)" for m in DECISIONS), "calibration error (%)", "paper (%)")
-    return Table(f"Table I: {_SET_WORDS[scores['candidates']]}; {words}", heads, rows)
+    heads = ("method", *(METRIC_WORDS[metric] for metric in DECISIONS), "calibration error", "paper")
+    return Table(f"Table I, in %: {_SET_WORDS[scores['candidates']]}; {words}", heads, rows)
 
 
 def comparison_tables(comparisons: Sequence[Report], where: str) -> Iterator[Table]:
