@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.console.command_lines import print_interrupted, prints
+from datagen.console.command_lines import interruptible, print_interrupted, prints
 from datagen.console.options import AS_FOUND, AsJson, AssetSources, File, PathsOrAddresses, Whole
 from datagen.evaluation.output import Outputs, output_files, print_report, write_report
 from datagen.schemas.errors import InputError
@@ -107,7 +107,6 @@ def evaluate(
     if closed_loop:
         from datagen.evaluation.arrival_outcomes import PLAN, SIM, make_all
         from datagen.evaluation.closed_loop import loop_record, plan_loop
-        from datagen.train.training.launching import interruptible
 
         kept, mode = files[0].with_suffix(".arrivals"), SIM if execute else PLAN
         judged = [method.method for method in methods]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ def test_swapping_methods_negates_the_difference_and_equal_ones_differ_by_zero(
               (("late", skill), ("early", 0.3))}  # fmt: skip
     columns = replace(columns, label=label, scores={**scores, "same": scores["early"]})
 
-    def differences(first: str, second: str) -> dict[str, dict[str, float]]:
+    def differences(first: str, second: str) -> dict[str, dict[str, Any]]:
         methods = [
             Method(first, 0.5, TrainedBy("two-stage", "m")),
             Method(second, 0.5, TrainedBy("stage1", "m")),

@@ -172,7 +172,8 @@ def test_houses_that_were_trained_on_are_refused_or_reported_separately(
     assert 0 < count < SCENES
     clean = checkpoint(tmp_path / "clean.pt", "stage1", 1)
     for k, field in enumerate(("house_ids", "val_house_ids")):
-        leaky = checkpoint(tmp_path / f"{k}.pt", **{field: (house,)})
+        said: dict[str, Any] = {field: (house,)}
+        leaky = checkpoint(tmp_path / f"{k}.pt", **said)
         assert cli.run(["evaluate", clean, leaky, str(grids), *QUICK]) == 2
         error = capsys.readouterr().err
         assert (
