@@ -121,15 +121,17 @@ def read_benchmark(folder: Path | None = None) -> Benchmark:
 
 def present_runs(folder: str, benchmark: Benchmark) -> dict[str, BenchmarkRun]:
     """The benchmark's runs that a folder or address has. InputError for none."""
-    found: dict[str, BenchmarkRun] = {}
-    for name, run in benchmark.runs.items():
-        storage = open_storage(f"{folder}/{name}", probe=False, create=False)
-        if storage.exists("manifest.json"):
-            found[name] = run
+    found = {name: run for name, run in benchmark.runs.items() if _has_run(f"{folder}/{name}")}
     if not found:
         fix = "Make them with `datagen benchmark make`"
         raise InputError(folder, "--runs", f"has no run of benchmark {benchmark.version}", fix)
     return found
+
+
+def _has_run(path: str) -> bool:
+    if "://" not in path and not Path(path).is_dir():
+        return False
+    return open_storage(path, probe=False, create=False).exists("manifest.json")
 
 
 def digests_of(path: str | Path) -> RunDigests:

@@ -97,16 +97,18 @@ def test_labels_that_differ_are_not_the_benchmark(
 def test_freezing_writes_the_digests_of_the_runs(
     small_benchmark: Path, definition: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    known = read_benchmark(small_benchmark)
     for run in definition["runs"].values():
         run["digests"] = None
     definition["runs"]["later"] = definition["runs"]["test"] | {"about": "not made"}
-    file = tmp_path / "benchmark.json"
-    file.write_text(json.dumps(definition))
-    monkeypatch.setattr(sys, "argv", ["freeze", str(file), str(small_benchmark), "--version", "2"])
+    for name in known.runs:
+        (tmp_path / name).symlink_to(small_benchmark / name)
+    (tmp_path / "benchmark.json").write_text(json.dumps(definition))
+    monkeypatch.setattr(sys, "argv", ["freeze", str(tmp_path), "--version", "2"])
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(REPOSITORY / "scripts" / "freeze_benchmark.py"), run_name="__main__")
     assert ended.value.code == 1
-    frozen, known = read_benchmark(tmp_path), read_benchmark(small_benchmark)
+    frozen = read_benchmark(tmp_path)
     assert frozen.version == "2" and frozen.runs["later"].digests is None
     assert {n: frozen.runs[n] for n in known.runs} == known.runs
 
