@@ -110,7 +110,6 @@ FITTED=(--fit "$OUT/runs/val-in-range" --fit "$OUT/runs/val-clear" --heuristic "
 if ! made_after "$OUT/tables.json" "${MODELS[@]}" "$OUT/rule.toml"; then
     step "evaluate"
     datagen evaluate "${MODELS[@]}" "$OUT"/runs/test-{in-range,grid} "${FITTED[@]}" \
-        --html "$OUT/tables.html" --json > "$OUT/tables.json.new"
-    mv "$OUT/tables.json.new" "$OUT/tables.json"
+        --out "$OUT/tables.html" --out "$OUT/tables.json"
 fi
 step "done: tables.html, tables.json and rule.toml in $OUT"

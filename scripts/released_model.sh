@@ -36,6 +36,6 @@ step scores
 [ board.json -nt model.ckpt ] || datagen benchmark score model.ckpt scalars reachability distance proximity \
     --runs runs --fit val --out board.json --out board.html
 step "closed loop"
-datagen closed-loop model.ckpt runs/grids --fit val --baselines scalars --baselines reachability --baselines distance \
-    --mode plan --scenes "$SCENES" --out loop
+[ loop.json -nt model.ckpt ] || datagen evaluate model.ckpt runs/grids --fit val --baselines scalars --baselines reachability \
+    --baselines distance --closed-loop "$SCENES" --out loop.json --out loop.html
 step "all is done"
