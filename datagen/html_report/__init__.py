@@ -1,1 +1,1 @@
-"""Runs and checkpoints as one HTML page that opens offline."""
+"""Runs, checkpoints and evaluations as one HTML page that opens offline."""
