@@ -69,7 +69,7 @@ _HEADINGS: dict[str, dict[str, tuple[str, str]]] = {
         "predict": ("datagen.commands.predict:predict", "Find a base pose in a depth camera's frame."),
     },
     "This machine": {
-        "assets": ("datagen.assets.cli:app", "List, fetch, lock, verify and split houses and objects."),
+        "assets": ("datagen.assets.cli:app", "List, fetch and split houses and objects."),
         "doctor": ("datagen.doctor:doctor", "Check this machine, and show how to fix what is missing."),
     },
 }

@@ -102,9 +102,7 @@ def option_cases(folder: Path) -> Iterator[Case]:
             locked = folder / f"locked {kind}"
             locked.mkdir()
             put(locked / "assets.lock.json")
-            yield Case("assets verify", f"{kind} as lock", ["assets", "verify", str(locked)])
-            (locked / "assets.lock.json").rename(locked / "mesh.obj")
-            yield Case("assets lock", f"{kind} as asset", ["assets", "lock", str(locked)])
+            yield Case("assets fetch", f"{kind} as lock", ["assets", "fetch", "ycb", "--out", str(locked)])
     for out in ("/proc/x", "/sys/x", "/dev/null/x", "/dev/null", "", "x" * 5000, f"{folder}/{'x' * 5000}"):
         words = [*submit[:-1], out]
         yield Case("submit --out", out[:12] or "empty", words)
@@ -116,7 +114,7 @@ def archive_cases(folder: Path, site: Site) -> Iterator[Case]:
         site.files[f"/{number}/013_apple_google_16k.tgz"] = make()
         words = ["assets", "fetch", "ycb-scans/013_apple", "--mirror", f"{site.url}/{number}"]
         home = folder / f"fetch {number}"
-        yield Case("assets fetch", kind, [*words, "--cache", str(home / "cache"), "--out", str(home / "out")])
+        yield Case("assets fetch", kind, [*words, "--out", str(home / "out")])
 
 
 def run_case(case: Case, scratch: Path, memory_bytes: int, limit_s: float) -> Outcome:

@@ -1,18 +1,50 @@
-"""Download assets of the catalogue into a folder with a lock file."""
+"""Download assets of the catalogue into a folder with a lock file.
+
+`assets.lock.json` lists each download's address, digest, size and licence. A download whose publisher states
+no digest is trusted on first use: its digest is recorded there, and later fetches must match it.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError
 
 from datagen.assets.catalogue import CatalogueEntry
 from datagen.assets.download import DownloadPolicy, Progress, download
-from datagen.assets.lock import Lock, LockedDownload, locked_file, read_lock, sha256_of, write_lock
 from datagen.assets.unpack import Limits, unpack
 from datagen.schemas.errors import InputError
+from datagen.schemas.run_records import Digest, StoredRecord
+from datagen.schemas.untrusted_files import open_regular, read_regular
 from datagen.schemas.whole_files import whole_file
+
+LOCK_NAME = "assets.lock.json"
+_MAX_LOCK_BYTES = 2**20
+_MAX_FILE_BYTES = 2**40
+
+
+class LockedDownload(StoredRecord):
+    """One fetched file or archive. `trust` is the origin of the digest."""
+
+    name: str
+    url: str
+    sha256: Digest
+    size: Annotated[int, Field(ge=0, le=2**50)]
+    licence: str
+    trust: Literal["published", "first-use"]
+
+
+class Lock(StoredRecord):
+    """The content of a lock file."""
+
+    version: Literal[1] = 1
+    downloads: tuple[LockedDownload, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -27,35 +59,41 @@ class Fetched:
     files: int
 
 
+def read_lock(folder: Path) -> Lock:
+    """The folder's lock file, empty where there is none. Raises InputError for a damaged one."""
+    path = folder / LOCK_NAME
+    if not path.exists():
+        return Lock()
+    fix = "Restore it, or remove it to trust the next downloads"
+    try:
+        return Lock.model_validate_json(read_regular(path, _MAX_LOCK_BYTES, fix))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(path, ".".join(map(str, first["loc"])), first["msg"], fix) from error
+
+
 def fetch(
     asset: CatalogueEntry,
     folder: Path,
     *,
     cache: Path,
     mirror: str | None = None,
-    offline: bool = False,
     progress: Progress = lambda here, total: None,
     policy: DownloadPolicy | None = None,
 ) -> Fetched:
     """Download one asset, or take it from the cache, unpack it and record it in the lock file.
 
-    Where the publisher states no digest, the first download is trusted and its digest recorded; later ones
-    must match it. `mirror` replaces the address before the file name. Raises InputError as `download` and
-    `unpack` do and, with `offline`, where the cache lacks the file.
+    `mirror` replaces the address before the file name. Raises InputError as `download` and `unpack` do.
     """
-    lock = (read_lock(folder) if folder.is_dir() else None) or Lock()
+    lock = read_lock(folder)
     recorded = next((d.sha256 for d in lock.downloads if d.name == asset.name), None)
     expected = asset.sha256 or recorded
-    url = f"{mirror.rstrip('/')}/{asset.file}" if mirror else asset.url
     kept = cache / asset.file
-    digest = sha256_of(kept) if kept.is_file() else None
+    digest = _sha256_of(kept) if kept.is_file() else None
     from_cache = digest is not None and expected in (None, digest)
     if digest is None or not from_cache:
-        if offline:
-            problem = "is not in the cache" if digest is None else f"has sha256 {digest}, not {expected}"
-            raise InputError(kept, "", problem, f"Put the file of {url} there, or omit --offline")
         digest = download(
-            url,
+            f"{mirror.rstrip('/')}/{asset.file}" if mirror else asset.url,
             kept,
             sha256=expected,
             size=asset.size,
@@ -65,10 +103,19 @@ def fetch(
         )
     size = kept.stat().st_size
     files = _install(asset, kept, folder)
-    trust = "published" if asset.sha256 else "first-use"
-    entry = LockedDownload(name=asset.name, url=asset.url, sha256=digest, size=size, trust=trust)
-    _record(folder, lock, entry, asset, files)
-    return Fetched(asset.name, digest, size, trust, from_cache, len(files))
+    entry = LockedDownload(
+        name=asset.name,
+        url=asset.url,
+        sha256=digest,
+        size=size,
+        licence=asset.licence,
+        trust="published" if asset.sha256 else "first-use",
+    )
+    downloads = {old.name: old for old in lock.downloads} | {entry.name: entry}
+    lock = Lock(downloads=tuple(downloads[name] for name in sorted(downloads)))
+    with whole_file(folder / LOCK_NAME, durable=True) as file:
+        file.write(json.dumps(lock.model_dump(), indent=1, sort_keys=True).encode() + b"\n")
+    return Fetched(asset.name, digest, size, entry.trust, from_cache, files)
 
 
 def refuse_full_disk(assets: Sequence[CatalogueEntry], folder: Path) -> None:
@@ -77,34 +124,20 @@ def refuse_full_disk(assets: Sequence[CatalogueEntry], folder: Path) -> None:
     existing = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
     free = shutil.disk_usage(existing).free
     if known > free:
-        raise InputError(
-            folder,
-            "",
-            f"{known:,} bytes are needed and {free:,} are free",
-            "Free some space, or use another disk",
-        )
+        problem = f"{known:,} bytes are needed and {free:,} are free"
+        raise InputError(folder, "", problem, "Free some space, or use another disk")
 
 
-def _install(asset: CatalogueEntry, kept: Path, folder: Path) -> list[str]:
-    """Move or unpack the download; return its files relative to `folder`."""
-    home = folder / asset.into
+def _install(asset: CatalogueEntry, kept: Path, folder: Path) -> int:
+    """Copy or unpack the download; return the number of its files."""
+    home = folder / PurePosixPath(asset.into)
     if asset.archive:
-        unpacked = unpack(kept, home, Limits(asset.max_unpacked_bytes))
-        return [(PurePosixPath(asset.into) / path).as_posix() for path in unpacked]
+        return len(unpack(kept, home, Limits(asset.max_unpacked_bytes)))
     with kept.open("rb") as source, whole_file(home / asset.file, alone=True) as file:
         shutil.copyfileobj(source, file)
-    return [(PurePosixPath(asset.into) / asset.file).as_posix()]
+    return 1
 
 
-def _record(folder: Path, lock: Lock, entry: LockedDownload, asset: CatalogueEntry, files: list[str]) -> None:
-    table = {old.path: old for old in lock.files}
-    for relative in files:
-        table[relative] = locked_file(folder, relative, asset.licence, asset.url)
-    downloads = {old.name: old for old in lock.downloads} | {entry.name: entry}
-    write_lock(
-        folder,
-        Lock(
-            files=tuple(table[key] for key in sorted(table)),
-            downloads=tuple(downloads[key] for key in sorted(downloads)),
-        ),
-    )
+def _sha256_of(path: Path) -> str:
+    with open_regular(path, _MAX_FILE_BYTES, "Remove the file, and fetch it again") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

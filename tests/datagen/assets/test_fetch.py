@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from datagen import cli
 from datagen.assets.catalogue import CATALOGUE, CatalogueEntry, select
 from datagen.assets.download import DownloadPolicy, download
-from datagen.assets.fetch import fetch
-from datagen.assets.lock import read_lock, verify
+from datagen.assets.fetch import LOCK_NAME, fetch, read_lock
 from datagen.schemas.errors import InputError
 from tests.datagen.assets.flaky_server import Site, serve
 
@@ -184,10 +184,8 @@ def test_first_use_is_recorded_and_then_held_to(site: Site, tmp_path: Path) -> N
     done = fetch(_asset(), tmp_path / "out", cache=tmp_path / "c1", mirror=site.url, policy=quick)
     assert (done.trust, done.files, done.from_cache) == ("first-use", 2, False)
     assert (tmp_path / "out/toy/a/b.txt").read_bytes() == b"hello"
-    assert verify(tmp_path / "out").good
-    lock = read_lock(tmp_path / "out")
-    assert lock is not None
-    assert {f.path: f.licence for f in lock.files} == {"toy/a/b.txt": "CC0-1.0", "toy/c.txt": "CC0-1.0"}
+    (entry,) = read_lock(tmp_path / "out").downloads
+    assert (entry.name, entry.licence, entry.sha256) == ("toy", "CC0-1.0", done.sha256)
 
     site.files["/toy.zip"] = _zip({"a/b.txt": b"changed"})
     with pytest.raises(InputError, match="not the expected file"):
@@ -195,17 +193,12 @@ def test_first_use_is_recorded_and_then_held_to(site: Site, tmp_path: Path) -> N
     assert (tmp_path / "out/toy/a/b.txt").read_bytes() == b"hello"
 
 
-def test_offline_uses_the_cache_alone(site: Site, tmp_path: Path) -> None:
+def test_a_kept_download_is_used_again(site: Site, tmp_path: Path) -> None:
     site.files["/toy.zip"] = _zip({"a.txt": b"hello"})
-    with pytest.raises(InputError, match="not in the cache"):
-        fetch(_asset(), tmp_path / "out", cache=tmp_path / "c", offline=True)
     fetch(_asset(), tmp_path / "out", cache=tmp_path / "c", mirror=site.url)
     n_requests = len(site.requests)
-    again = fetch(_asset(), tmp_path / "other", cache=tmp_path / "c", offline=True)
+    again = fetch(_asset(), tmp_path / "other", cache=tmp_path / "c")
     assert again.from_cache and len(site.requests) == n_requests
-    (tmp_path / "c/toy.zip").write_bytes(b"spoilt")
-    with pytest.raises(InputError, match="sha256"):
-        fetch(_asset(), tmp_path / "out", cache=tmp_path / "c", offline=True)
 
 
 def test_a_spoilt_cache_is_fetched_again(site: Site, tmp_path: Path) -> None:
@@ -232,35 +225,35 @@ def test_the_catalogue_is_whole() -> None:
         select(["yc"])
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[]",
+        json.dumps({"version": 2}),
+        json.dumps({"version": 1, "surprise": 1}),
+        json.dumps({"version": 1, "downloads": [{"name": "a", "sha256": "0", "size": 1}]}),
+    ],
+)
+def test_broken_locks_are_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / LOCK_NAME).write_text(text)
+    with pytest.raises(InputError) as caught:
+        fetch(_asset(), tmp_path, cache=tmp_path / "c")
+    assert LOCK_NAME in str(caught.value) and "\n" not in str(caught.value)
+
+
 def test_the_command_line(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
                           capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
-    from datagen.cli import run
-
+    monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "cache"))
     asset = CATALOGUE["procthor-10k/asset-sizes"]
     site.files[f"/{asset.file}"] = b"{}"
-    arguments = ["--out", str(tmp_path / "out"), "--cache", str(tmp_path / "c"), "--mirror", site.url]
-    assert run(["assets", "fetch", asset.name, *arguments, "--json"]) == 0
+    arguments = ["--out", str(tmp_path / "out"), "--mirror", site.url]
+    assert cli.run(["assets", "fetch", asset.name, *arguments, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["fetched"][0]["trust"] == "first-use"
     assert (tmp_path / "out/procthor/asset-database.json").read_bytes() == b"{}"
-    assert run(["assets", "verify", str(tmp_path / "out")]) == 0
-    assert run(["assets", "list", str(tmp_path / "out")]) == 0
-    assert "Apache-2.0" in capsys.readouterr().out
-    assert run(["assets", "list"]) == 0
+    assert cli.run(["assets", "list"]) == 0
     assert "procthor-10k/train" in capsys.readouterr().out
-
-    (tmp_path / "out/procthor/asset-database.json").write_bytes(b"[]")
-    assert run(["assets", "verify", str(tmp_path / "out"), "--json"]) == 2
-    assert json.loads(capsys.readouterr().out)["changed"] == ["procthor/asset-database.json"]
-    assert run(["assets", "verify", str(tmp_path / "out")]) == 2
-    assert "asset-database.json" in capsys.readouterr().err
-    assert run(["assets", "lock", str(tmp_path / "out")]) == 0
-    assert run(["assets", "verify", str(tmp_path / "out")]) == 0
-    for wrong in (
-        ["fetch"],
-        ["fetch", "nothing"],
-        ["verify", str(tmp_path / "no")],
-        ["lock", str(tmp_path / "no")],
-    ):
+    for wrong in (["fetch"], ["fetch", "nothing"]):
         capsys.readouterr()
-        assert run(["assets", *wrong]) == 2
+        assert cli.run(["assets", *wrong]) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1

@@ -1,11 +1,11 @@
-"""Archives that try to get out or grow without end, and locks that lie."""
+"""Archives that try to get out, or grow without end by their members, lists or headers."""
 
 from __future__ import annotations
 
 import gzip
 import io
-import json
 import stat
+import struct
 import tarfile
 import zipfile
 from collections.abc import Callable
@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from datagen.assets.lock import LOCK_NAME, lock, read_lock, verify
 from datagen.assets.unpack import Limits, unpack
 from datagen.schemas.errors import InputError
 
@@ -125,49 +124,37 @@ def test_a_link_in_the_folder_carries_nothing_out(tmp_path: Path) -> None:
     assert list((tmp_path / "elsewhere").iterdir()) == []
 
 
-def test_lock_and_verify_see_every_change(tmp_path: Path) -> None:
-    for name, text in (("a.txt", "A"), ("d/b.txt", "B"), ("d/c.txt", "C")):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text(text)
-    written = lock(tmp_path, licence="CC0-1.0", source="here")
-    assert [entry.path for entry in written.files] == ["a.txt", "d/b.txt", "d/c.txt"]
-    assert read_lock(tmp_path) == written
-    assert verify(tmp_path).good
-    (tmp_path / "a.txt").write_text("X")
-    (tmp_path / "d/b.txt").unlink()
-    (tmp_path / "new.txt").write_text("N")
-    result = verify(tmp_path)
-    assert (result.changed, result.missing, result.unlisted) == (("a.txt",), ("d/b.txt",), ("new.txt",))
-    assert not result.good
-    again = lock(tmp_path)
-    assert {entry.path: entry.licence for entry in again.files} == {
-        "a.txt": "CC0-1.0", "d/c.txt": "CC0-1.0", "new.txt": "unknown",
-    }  # fmt: skip
+def long_list() -> bytes:
+    """A zip whose end states a list of members of 100 MB."""
+    return (
+        b"PK\x01\x02"
+        + bytes(100_000_000)
+        + struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 9, 9, 100_000_004, 0, 0)
+    )
+
+
+def honest_bomb() -> bytes:
+    """A zip of members that state that they are far beyond the limit together."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as packed:
+        for number in range(20):
+            packed.writestr(f"{number}", bytes(100_000))
+    return buffer.getvalue()
+
+
+def nested_headers() -> bytes:
+    """A tar of long names that are each the name of another long name."""
+    info = tarfile.TarInfo("././@LongLink")
+    info.type, info.size = tarfile.GNUTYPE_LONGNAME, 512
+    return (info.tobuf(tarfile.GNU_FORMAT) + b"a" * 511 + b"\0") * 5000
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        "{",
-        "[]",
-        json.dumps({"version": 2}),
-        json.dumps({"version": 1, "surprise": 1}),
-        json.dumps({"version": 1, "files": [{"path": "a", "sha256": "0", "size": 1}]}),
-        json.dumps({"version": 1, "files": [{"path": "a", "sha256": "0" * 64, "size": -1}]}),
-        json.dumps({"version": 1, "files": [{"path": "../a", "sha256": "0" * 64, "size": 1}]}),
-        json.dumps({"version": 1, "files": [{"path": "/etc/hostname", "sha256": "0" * 64, "size": 1}]}),
-    ],
+    ("make", "said"),
+    [(long_list, "too large"), (honest_bomb, "2,000,000 bytes"), (nested_headers, "damaged")],
 )
-def test_broken_locks_are_refused(text: str, tmp_path: Path) -> None:
-    (tmp_path / LOCK_NAME).write_text(text)
-    with pytest.raises(InputError) as caught:
-        verify(tmp_path)
-    assert LOCK_NAME in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_no_lock_and_nothing_to_lock(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="does not exist"):
-        verify(tmp_path)
-    with pytest.raises(InputError, match="no files"):
-        lock(tmp_path)
+def test_a_bomb_in_the_description_is_refused(make: Callable[[], bytes], said: str, tmp_path: Path) -> None:
+    (tmp_path / "archive").write_bytes(make())
+    with pytest.raises(InputError, match=said):
+        unpack(tmp_path / "archive", tmp_path / "out", Limits(1_000_000))
+    assert list((tmp_path / "out").iterdir()) == []
