@@ -185,17 +185,10 @@ def short_line(text: str) -> str:
 
 @dataclass(frozen=True)
 class Note:
-    """The note that a worker wrote about its process when it began an attempt."""
+    """What a worker left of an attempt: its process, when it began, and its last stack ("" for none)."""
 
-    host: Host
-    started: str
-
-
-@dataclass(frozen=True)
-class PostMortem:
-    """The files that a dead worker left of an attempt: its note, and its last stack ("" for none)."""
-
-    note: Note | None = None
+    host: Host | None = None
+    started: str = ""
     stack: str = ""
 
 
@@ -225,23 +218,23 @@ def read_note(notes: str, attempt: str) -> Note | None:
     return Note(Host(**found["host"]), found["started"])
 
 
-def collect_post_mortem(notes: str, attempt: str) -> PostMortem:
+def collect_post_mortem(notes: str, attempt: str) -> Note:
     """Read, and remove, the note and the stack file that a dead worker left on this machine."""
     if not notes:
-        return PostMortem()
-    note, path = read_note(notes, attempt), stack_path(notes, attempt)
+        return Note()
+    note, path = read_note(notes, attempt) or Note(), stack_path(notes, attempt)
     try:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - STACK_LIMIT))
-            stack = file.read(STACK_LIMIT).decode(errors="replace")
+            note = replace(note, stack=file.read(STACK_LIMIT).decode(errors="replace"))
     except FileNotFoundError:
-        stack = ""
+        pass
     path.unlink(missing_ok=True)
     note_path(notes, attempt).unlink(missing_ok=True)
-    return PostMortem(note, stack)
+    return note
 
 
-def failure_report(task: Task, outcome: Outcome, cause: str, left: PostMortem | None = None) -> AttemptReport:
+def failure_report(task: Task, outcome: Outcome, cause: str, left: Note | None = None) -> AttemptReport:
     """The report of an attempt whose worker died, from its files on this machine, or from `left`.
 
     A cause of many lines is cut to one; where the worker left no stack, its whole text is the stack.
@@ -249,7 +242,7 @@ def failure_report(task: Task, outcome: Outcome, cause: str, left: PostMortem | 
     counted from the note; the CPU time is lost with the process, and is 0.
     """
     left, ended = left or collect_post_mortem(task.notes, task.attempt), utc_now()
-    note, stack = left.note, left.stack
+    stack = left.stack
     line = short_line(cause)
     if line != cause:
         stack, cause = stack or cause[-STACK_LIMIT:], line
@@ -258,18 +251,18 @@ def failure_report(task: Task, outcome: Outcome, cause: str, left: PostMortem | 
     elif outcome == "crashed" and stack.startswith("Fatal Python error"):
         cause = stack.splitlines()[0]
     wall_s = 0.0
-    if note is not None:
-        wall_s = (datetime.fromisoformat(ended) - datetime.fromisoformat(note.started)).total_seconds()
+    if left.host is not None:
+        wall_s = (datetime.fromisoformat(ended) - datetime.fromisoformat(left.started)).total_seconds()
     return AttemptReport(
         task.attempt,
         task.shard,
         outcome,
         cause=cause,
         stack=stack,
-        started=note.started if note else "",
+        started=left.started,
         ended=ended,
-        cost=Cost(wall_s=max(0.0, wall_s), cpu_s=0.0) if note else None,
-        host=note.host if note else None,
+        cost=Cost(wall_s=max(0.0, wall_s), cpu_s=0.0) if left.host else None,
+        host=left.host,
     )
 
 

@@ -238,7 +238,7 @@ class _Driver(Generic[T]):
         elif decision.action == "quarantine":
             self._troubled.pop(shard, None)
             self._recorder.quarantine(shard, decision.trouble)
-            self._totals.count_quarantined(shard)
+            self._totals.quarantined += 1
             if ends_early(self._policy, self._totals.quarantined, self._totals.shards):
                 self._begin_end("failed", f"{self._totals.quarantined} shards are quarantined")
         is_futile = nothing_runs(self._policy, self._lost_in_a_row, self._width())

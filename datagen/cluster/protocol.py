@@ -17,7 +17,6 @@ from datagen.schemas.specification import Specification
 T_contra = TypeVar("T_contra", contravariant=True)
 End = Literal["complete", "failed", "interrupted", "aborted"]  # each worse than the one before
 EXIT_CODES = {"failed": 1, "aborted": 2, "interrupted": 130}  # of the command line; 0 for other ends
-_NAMED = 20  # quarantined shards that the totals list by number
 
 
 class Task(Protocol):
@@ -116,7 +115,6 @@ class JobTotals:
     superseded: int = 0  # shards that another driver or an earlier attempt had committed
     elsewhere: int = 0  # shards that another driver had committed before an attempt began here
     quarantined: int = 0
-    quarantined_shards: list[int] = field(default_factory=list)  # the first few
     retries: int = 0
     in_flight: int = 0
     outcomes: Counter[Outcome] = field(default_factory=Counter)  # attempts by how they ended
@@ -146,14 +144,8 @@ class JobTotals:
             self.wasted_wall_s += wall_s
             self.wasted_cpu_s += cpu_s
 
-    def count_quarantined(self, shard: int) -> None:
-        self.quarantined += 1
-        if len(self.quarantined_shards) < _NAMED:
-            self.quarantined_shards.append(shard)
-
     def plus(self, other: JobTotals) -> JobTotals:
         sums = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(JobTotals)}
-        sums["quarantined_shards"] = sums["quarantined_shards"][:_NAMED]
         return JobTotals(**sums)
 
 

@@ -57,7 +57,7 @@ _START_FIX = "Start Ray there and give HOST:PORT, or use --address local"
 class RaySettings:
     """Address and size of a cluster."""
 
-    address: str = "local"  # or `auto`, `HOST:PORT`, `ray://...` of a running cluster
+    address: str = "local"  # or `auto`, `HOST:PORT` of a running cluster
     workers: int | None = None  # slots of a local cluster; None: one per core
     attempts_per_worker: int = 200  # then a new process, because of memory leaks
     object_store_bytes: int = OBJECT_STORE_BYTES
@@ -143,8 +143,8 @@ def refuse_unusable(address: str) -> None:
 
 
 def refuse_unreachable(address: str) -> None:
-    """Raise InputError where no server listens at a `[ray://]HOST:PORT`."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
+    """Raise InputError where no server listens at HOST:PORT."""
+    host, _, port = address.rpartition(":")
     if not host or not (port.isascii() and port.isdigit() and len(port) < 6):
         raise InputError("--address", address, "is not the address of a cluster", _START_FIX)
     try:
@@ -160,9 +160,6 @@ def token_for(address: str) -> dict[str, str]:
     A token is sent only to a cluster that requires one. Raises InputError where none is set, or the cluster
     refuses it.
     """
-    if address.startswith("ray://"):  # another protocol, without this request
-        found = known_token()
-        return token_environment(found[0]) if found else {"RAY_AUTH_MODE": "disabled"}
     if not _refuses(address, None):
         return {"RAY_AUTH_MODE": "disabled"}
     found = known_token()

@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 
 from datagen.cluster.attempt_guard import (
     Meter,
-    PostMortem,
+    Note,
     clear_notes,
     collect_post_mortem,
     failure_report,
@@ -23,7 +23,7 @@ from datagen.cluster.attempt_guard import (
 )
 from datagen.cluster.protocol import AttemptReport, AttemptResult, Task
 from datagen.cluster.ray_cluster import RaySettings, first_line, ray_cluster
-from datagen.cluster.ray_nodes import OtherNodes, Question, attempts_begun, end_attempts, post_mortems_of
+from datagen.cluster.ray_nodes import OtherNodes, attempts_begun, end_attempts, post_mortems_of
 from datagen.schemas.errors import InputError
 from datagen.schemas.run_records import Outcome
 
@@ -32,7 +32,7 @@ _BEGUN_SEEN_FOR_S = 1.0
 # A forced cancellation normally kills a worker at once; after this, it is killed by the pid in its note.
 _CANCELLED_WITHIN_S = 1.0
 # Timeout for other machines, which may have to start a process first.
-_BEGUN_WITHIN_S, _POST_MORTEM_WITHIN_S, _FORGOTTEN_WITHIN_S = 10.0, 30.0, 5.0
+_BEGUN_WITHIN_S, _POST_MORTEM_WITHIN_S, _FORGOTTEN_WITHIN_S = 10.0, 15.0, 5.0
 
 T = TypeVar("T", bound=Task)
 
@@ -44,14 +44,6 @@ class _Death(Generic[T]):
     task: T
     outcome: Outcome
     cause: str
-
-
-@dataclass
-class _PostMortemCheck(Generic[T]):
-    """Deaths without a post-mortem on this machine, and the request for it to the other machines."""
-
-    deaths: list[_Death[T]]
-    question: Question
 
 
 @contextmanager
@@ -97,7 +89,6 @@ class RayExecutor(Generic[T]):
         self._options: dict[str, Any] = {"num_cpus": 1, "max_retries": 0, "max_calls": attempts}
         self._tasks: dict[Any, T] = {}  # by the reference to the result
         self._refs: dict[str, Any] = {}  # by attempt
-        self._post_mortem_checks: list[_PostMortemCheck[T]] = []
         self._killed: dict[str, float] = {}  # attempts to kill, and when to kill them by their notes
         self._begun_elsewhere: set[str] = set()
         self._begun_until_s = 0.0
@@ -124,24 +115,19 @@ class RayExecutor(Generic[T]):
         self._jobs.add(task.notes)
 
     def wait(self, timeout_s: float) -> list[AttemptReport]:
-        requested = [ref for check in self._post_mortem_checks for ref in check.question.silent]
-        if not self._tasks and not requested:
-            if not self._post_mortem_checks:
-                time.sleep(timeout_s)
-            return self._ended_post_mortem_checks()
+        if not self._tasks:
+            time.sleep(timeout_s)
+            return []
         if dead := self.others.own.dead():
             return self._lose_all(dead)
         self._end_stubborn()
-        refs = [*self._tasks, *requested]
+        refs = list(self._tasks)
         ready, _ = self._ray.wait(refs, num_returns=1, timeout=timeout_s)
         if ready:  # also take all others that have ended
             ready, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)
-        for check in self._post_mortem_checks:
-            self.others.collect(check.question, ready)
-        ended = [self._result(ref) for ref in ready if ref in self._tasks]
+        ended = [self._result(ref) for ref in ready]
         reports = [result for result in ended if not isinstance(result, _Death)]
-        reports += self._failure_reports([result for result in ended if isinstance(result, _Death)])
-        return reports + self._ended_post_mortem_checks()
+        return reports + self._failure_reports([result for result in ended if isinstance(result, _Death)])
 
     def has_begun(self, attempt: str) -> bool:
         ref = self._refs.get(attempt)
@@ -184,19 +170,18 @@ class RayExecutor(Generic[T]):
         self._killed.update(dict.fromkeys(due, float("inf")))
         stubborn = [self._tasks[ref] for a in due if (ref := self._refs.get(a)) is not None]
         for notes, attempts in self._by_notes(stubborn).items():
-            self.others.put(end_attempts, notes, attempts, patience_s=0.0)  # without waiting
+            self.others.send(end_attempts, notes, attempts)  # without waiting
 
     def _lose_all(self, cause: str) -> list[AttemptReport]:
         refs = list(self._tasks)
         ended = [self._result(r) for r in refs and self._ray.wait(refs, num_returns=len(refs), timeout=0)[0]]
         reports = [result for result in ended if not isinstance(result, _Death)]
         deaths = [result for result in ended if isinstance(result, _Death)]
-        deaths += [death for check in self._post_mortem_checks for death in check.deaths]
         deaths += [
             _Death(task, "cancelled" if task.attempt in self._killed else "lost", cause)
             for task in self._tasks.values()
         ]
-        for known in (self._tasks, self._refs, self._killed, self._post_mortem_checks):
+        for known in (self._tasks, self._refs, self._killed):
             known.clear()
         ends_job = self._restart is None
         if self._restart is not None:
@@ -231,36 +216,13 @@ class RayExecutor(Generic[T]):
 
     def _failure_reports(self, deaths: list[_Death[T]]) -> list[AttemptReport]:
         """Reports of dead attempts from their files here; other machines are asked for the rest."""
-        reports: list[AttemptReport] = []
-        unknown: dict[str, list[_Death[T]]] = defaultdict(list)
-        has_others = bool(deaths) and bool(self.others.alive())
-        for death in deaths:
-            here = collect_post_mortem(death.task.notes, death.task.attempt)
-            has_no_note = here.note is None and death.outcome != "lost" and bool(death.task.notes)
-            if has_others and has_no_note:
-                unknown[death.task.notes].append(death)
-            else:
-                reports.append(_report_of(death, here))
-        for notes, found in unknown.items():
-            attempts = [death.task.attempt for death in found]
-            question = self.others.put(post_mortems_of, notes, attempts, patience_s=_POST_MORTEM_WITHIN_S)
-            self._post_mortem_checks.append(_PostMortemCheck(found, question))
-        return reports
-
-    def _ended_post_mortem_checks(self) -> list[AttemptReport]:
-        """Reports of those whose post-mortem was found, or that no machine knows of."""
-        reports: list[AttemptReport] = []
-        now_s = time.monotonic()
-        for check in list(self._post_mortem_checks):
-            question, left = check.question, dict[str, PostMortem]()
-            for answer in question.answers.values():
-                left |= answer
-            if question.silent and len(left) < len(check.deaths) and now_s < question.until_s:
-                continue
-            self._post_mortem_checks.remove(check)
-            for death in check.deaths:
-                reports.append(_report_of(death, left.get(death.task.attempt, PostMortem())))
-        return reports
+        left = {d.task.attempt: collect_post_mortem(d.task.notes, d.task.attempt) for d in deaths}
+        unknown = [d.task for d in deaths if left[d.task.attempt].host is None and d.outcome != "lost"]
+        for notes, attempts in self._by_notes(unknown).items():
+            answers = self.others.ask(post_mortems_of, notes, attempts, patience_s=_POST_MORTEM_WITHIN_S)
+            for found in answers.values():
+                left |= found
+        return [_report_of(death, left[death.task.attempt]) for death in deaths]
 
     @staticmethod
     def _by_notes(tasks: Iterable[T]) -> dict[str, list[str]]:
@@ -271,9 +233,9 @@ class RayExecutor(Generic[T]):
         return found
 
 
-def _report_of(death: _Death[Any], left: PostMortem) -> AttemptReport:
+def _report_of(death: _Death[Any], left: Note) -> AttemptReport:
     outcome, cause = death.outcome, death.cause
     # An attempt has a note from its begin to its end: without one, the shard did not crash the worker.
-    if outcome == "crashed" and left.note is None and death.task.notes:
+    if outcome == "crashed" and left.host is None and death.task.notes:
         outcome, cause = "lost", "its worker died before it began or after it ended, or with its machine"
     return failure_report(death.task, outcome, cause, left)

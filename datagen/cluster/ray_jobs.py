@@ -10,7 +10,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from datagen.cluster.environment import JOB_ENVIRONMENT, changed_environment
-from datagen.cluster.ray_cluster import first_line, known_token, refuse_unreachable, token_for
+from datagen.cluster.ray_cluster import first_line, known_token
 from datagen.schemas.errors import InputError
 
 _FIX = "Give the cluster's dashboard, http://HOST:8265, and its token as RAY_AUTH_TOKEN where it requires one"
@@ -85,40 +85,28 @@ class RayJobs:
         return [str(job.entrypoint) for job in self._client.list_jobs() if job.status.value in _WORK]
 
 
-def open_ray_jobs(address: str, token: str = "") -> RayJobs:
-    """Open the Jobs API at a dashboard (`http://HOST:PORT`) or cluster (`HOST:PORT`, `ray://...`, `auto`).
+def open_ray_jobs(url: str, token: str = "") -> RayJobs:
+    """Open the Jobs API of a cluster's dashboard, `http://HOST:PORT`.
 
-    Without `token`, the one that Ray would use is sent to a cluster that requires one. InputError where no
-    cluster responds, or it refuses the token.
+    Without `token`, the one that Ray would use is sent to a dashboard that requires one. InputError where
+    none responds, or it refuses the token.
     """
-    changed: dict[str, str | None] = dict.fromkeys(_OVERRIDES)
-    if "@" in address:
+    if "@" in url:
         fix = "Remove it; set a token as RAY_AUTH_TOKEN"
         raise InputError("--address", "", "has a password, which would appear in records and logs", fix)
-    if address.startswith(("http://", "https://")):
-        url = address
-    else:
-        url = f"http://{address}" if _is_dashboard(address) else ""
-        if not url:
-            refuse_unreachable(address)
-            # The request for the dashboard's address needs the token of a cluster that requires one.
-            changed |= {} if address == "auto" else token_for(address)
-    if not token and (found := known_token()) and (not url or dashboard_status(url) in (401, 403)):
+    if not url.startswith(("http://", "https://")):
+        raise InputError("--address", url, "is not the address of a dashboard", _FIX)
+    if not token and (found := known_token()) and dashboard_status(url) in (401, 403):
         token = found[0]
-    with changed_environment(changed):
+    with changed_environment(dict.fromkeys(_OVERRIDES)):
         from ray.exceptions import RayError
         from ray.job_submission import JobSubmissionClient
 
         try:
-            client = JobSubmissionClient(url or address, headers=_headers(token) or None)
+            client = JobSubmissionClient(url, headers=_headers(token) or None)
         except (RayError, ConnectionError, RuntimeError, ValueError, OSError) as error:
-            raise InputError("--address", address, first_line(error), _FIX) from error
+            raise InputError("--address", url, first_line(error), _FIX) from error
         return RayJobs(str(client.get_address()), client)
-
-
-def _is_dashboard(address: str) -> bool:
-    """Whether HOST:PORT is a dashboard: other ports of a cluster do not respond to HTTP."""
-    return "://" not in address and address != "auto" and dashboard_status(f"http://{address}") is not None
 
 
 def dashboard_status(url: str, token: str = "") -> int | None:

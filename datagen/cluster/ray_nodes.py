@@ -7,12 +7,11 @@ import platform
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from datagen.cluster.attempt_guard import PostMortem, collect_post_mortem, read_note
+from datagen.cluster.attempt_guard import Note, collect_post_mortem, read_note
 
 _SKIPPED_S = 30.0  # a machine that did not respond gets no request for this time
 _LOOK_S, _CONNECTS_WITHIN_S = 1.0, 2.0
@@ -28,14 +27,14 @@ class OwnNode:
     """
 
     def __init__(self, ray: Any, address: str) -> None:
-        # Private: the raylet's socket has no public name. None for a client (ray://), which needs neither.
+        # Private: the raylet's socket has no public name.
         self._node = ray._private.worker._global_node
         self._patience_s = 0.0 if address == "local" else _PATIENCE_S
         self._responded_s = self._looked_s = time.monotonic()
 
     def dead(self) -> str:
         """The server that has not responded for too long; "" for none."""
-        if self._node is None or time.monotonic() < self._looked_s + _LOOK_S:
+        if time.monotonic() < self._looked_s + _LOOK_S:
             return ""
         self._looked_s, silent = time.monotonic(), self.silent()
         if not silent:
@@ -44,8 +43,6 @@ class OwnNode:
 
     def silent(self) -> str:
         """The server that does not respond now; "" for none."""
-        if self._node is None:
-            return ""
         host, _, port = self._node.gcs_address.rpartition(":")
         try:
             socket.create_connection((host.strip("[]"), int(port)), _CONNECTS_WITHIN_S).close()
@@ -60,15 +57,6 @@ class OwnNode:
         return ""
 
 
-@dataclass
-class Question:
-    """A request to every other machine, with the results so far by the machine's name."""
-
-    silent: dict[Any, tuple[str, str]]  # reference to the result -> the machine's id and name
-    until_s: float  # timeout
-    answers: dict[str, Any] = field(default_factory=dict)
-
-
 class OtherNodes:
     """The machines of a cluster except the driver's own.
 
@@ -80,8 +68,7 @@ class OtherNodes:
         self._ray = ray
         self.own = OwnNode(ray, address)
         self._alone = address == "local"
-        # A client of `ray://` is not a machine of the cluster.
-        self._own = "" if address.startswith("ray://") else str(ray.get_runtime_context().get_node_id())
+        self._own = str(ray.get_runtime_context().get_node_id())
         self._skipped_until_s: dict[str, float] = {}
         self._tasks: dict[Callable[..., Any], Any] = {}  # each is sent to the cluster once
 
@@ -100,18 +87,25 @@ class OtherNodes:
 
         Machines that did not respond to the last request are skipped for a while.
         """
+        until_s, answers = time.monotonic() + patience_s, dict[str, Any]()
         now_s = time.monotonic()
-        skipped = [node for node, until_s in self._skipped_until_s.items() if now_s < until_s]
-        question = self.put(function, *arguments, patience_s=patience_s, but=skipped)
-        while question.silent and (left_s := question.until_s - time.monotonic()) > 0:
-            ready, _ = self._ray.wait(list(question.silent), num_returns=1, timeout=left_s)
-            self.collect(question, ready)
-        self._skipped_until_s |= dict.fromkeys((n for n, _ in question.silent.values()), now_s + _SKIPPED_S)
-        return question.answers
+        skipped = [node for node, skipped_s in self._skipped_until_s.items() if now_s < skipped_s]
+        silent = self.send(function, *arguments, but=skipped)
+        while silent and (left_s := until_s - time.monotonic()) > 0:
+            ready, _ = self._ray.wait(list(silent), num_returns=1, timeout=left_s)
+            for ref in ready:
+                _, name = silent.pop(ref)
+                try:
+                    answers[name] = self._ray.get(ref)
+                except self._ray.exceptions.RayError:  # the machine was lost, or cannot load this package
+                    continue
+        self._skipped_until_s |= dict.fromkeys((node for node, _ in silent.values()), until_s + _SKIPPED_S)
+        return answers
 
-    def put(
-        self, function: Callable[..., Any], *arguments: Any, patience_s: float, but: Sequence[str] = ()
-    ) -> Question:
+    def send(
+        self, function: Callable[..., Any], *arguments: Any, but: Sequence[str] = ()
+    ) -> dict[Any, tuple[str, str]]:
+        """Begin `function(*arguments)` on each machine: its id and name by the reference to the result."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         if function not in self._tasks:
@@ -123,16 +117,7 @@ class OtherNodes:
                 pinned = NodeAffinitySchedulingStrategy(node, soft=False)
                 ref = self._tasks[function].options(scheduling_strategy=pinned).remote(*arguments)
                 sent[ref] = (node, name)
-        return Question(sent, time.monotonic() + patience_s)
-
-    def collect(self, question: Question, ready: Iterable[Any]) -> None:
-        """Collect the finished results among these references."""
-        for ref in [r for r in ready if r in question.silent]:
-            _, name = question.silent.pop(ref)
-            try:
-                question.answers[name] = self._ray.get(ref)
-            except self._ray.exceptions.RayError:  # the machine was lost, or cannot load this package
-                continue
+        return sent
 
 
 # Functions of the requests, which run on the other machines.
@@ -143,17 +128,17 @@ def attempts_begun(notes: str, attempts: Sequence[str]) -> list[str]:
     return [attempt for attempt in attempts if read_note(notes, attempt) is not None]
 
 
-def post_mortems_of(notes: str, attempts: Sequence[str]) -> dict[str, PostMortem]:
+def post_mortems_of(notes: str, attempts: Sequence[str]) -> dict[str, Note]:
     """Read, and remove, the files that dead workers of the attempts left on this machine."""
     found = {attempt: collect_post_mortem(notes, attempt) for attempt in attempts}
-    return {attempt: left for attempt, left in found.items() if left.note is not None}
+    return {attempt: left for attempt, left in found.items() if left.host is not None}
 
 
 def end_attempts(notes: str, attempts: Sequence[str]) -> None:
     """Kill the workers of this machine that run one of the attempts."""
     for attempt in attempts:
         note = read_note(notes, attempt)  # exists only while a process runs it
-        if note is not None and note.host.name == platform.node():
+        if note is not None and note.host is not None and note.host.name == platform.node():
             _kill_worker(note.host.pid)
 
 

@@ -29,6 +29,7 @@ _GIVE_UP_S = 180.0
 
 def cancel(
     run: Annotated[str | None, Parameter(name="RUN")] = None,
+    /,
     *,
     now: bool = False,
     head: bool = False,

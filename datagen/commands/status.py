@@ -103,16 +103,6 @@ def _print(name: str, storage: Storage, report: dict[str, Any]) -> None:
 
 
 def _print_failures(name: str, report: dict[str, Any]) -> None:
-    budgets = [
-        (
-            row["outcome"],
-            str(row["attempts"]),
-            str(row["shards"]),
-            f"{row['most_on_one_shard']} of {row['budget']}" if row["budget"] else "-",
-        )
-        for row in report["budgets"]
-    ]
-    print_rows("failures", budgets, ("kind", "attempts", "shards", "most per shard"))
     causes = [(cause, str(n)) for cause, n in report["causes"].items()]
     print_rows("causes", causes, ("cause", "attempts"))
     for cause, stack in report.get("stacks", {}).items():

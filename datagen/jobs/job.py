@@ -46,8 +46,8 @@ from datagen.schemas.storage import Storage
 from datagen.workers.extras import refuse_missing
 
 _DETACH = (
-    "Run as a Ray job that continues after this shell ends: on the cluster of --address (its dashboard "
-    "http://HOST:8265 or the cluster itself), else on a Ray head of this machine."
+    "Run as a Ray job that continues after this shell ends: on the cluster of --address, its dashboard "
+    "http://HOST:8265, else on a Ray head of this machine."
 )
 
 

@@ -5,26 +5,15 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.lineage import lineage_summary
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lifted_records
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Outcome
 from datagen.schemas.sealing import SealedPart, SealedRoot, sealed_root
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage
 
 _SHOWN = 20  # causes and stacks
-_GOOD = ("committed", "superseded", "cancelled")
-# Attempts that a shard may use in one job; crash, hang and failure share one budget.
-_BUDGETS: dict[Outcome, int] = {
-    "failed": RetryPolicy.max_failures,
-    "crashed": RetryPolicy.max_failures,
-    "hung": RetryPolicy.max_failures,
-    "out_of_memory": RetryPolicy.max_out_of_memory,
-    "lost": RetryPolicy.max_lost,
-}
 
 
 def runs_report(storage: Storage, stacks: bool = False) -> dict[str, Any]:
@@ -51,11 +40,8 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
     outcomes: Counter[str] = Counter()
     causes: Counter[str] = Counter()
     examples: dict[str, str] = {}  # an attempt of each cause
-    spent: dict[Outcome, Counter[int]] = {}  # attempts by shard
     for entry in ends:
         outcomes[entry.outcome] += 1
-        if entry.outcome not in _GOOD:
-            spent.setdefault(entry.outcome, Counter())[entry.shard] += 1
         if entry.cause:
             cause = f"{entry.outcome}: {entry.cause}"
             causes[cause] += 1
@@ -85,16 +71,6 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
         "attempts": dict(sorted(outcomes.items())),
         "attempts_without_end": len(unfinished),
         "causes": common,
-        "budgets": [
-            {
-                "outcome": outcome,
-                "attempts": counts.total(),
-                "shards": len(counts),
-                "most_on_one_shard": max(counts.values()),
-                "budget": _BUDGETS.get(outcome),
-            }
-            for outcome, counts in sorted(spent.items())
-        ],
         "quarantine": [
             {
                 "shard": record.shard,
@@ -148,21 +124,8 @@ def _sum(storage: Storage, parts: list[dict[str, Any]]) -> dict[str, Any]:
         for number, part in enumerate(parts)
         for q in part["quarantine"]
     ]
-    total["budgets"] = _sum_budgets([row for part in parts for row in part["budgets"]])
     known = [part["sealed_labels"] for part in parts if part["sealed_labels"] is not None]
     total["sealed_labels"] = sum(known) if known else None
     if "stacks" in parts[0]:
         total["stacks"] = {cause: stack for part in parts for cause, stack in part["stacks"].items()}
     return total | {"parts": parts}
-
-
-def _sum_budgets(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = {}
-    for row in rows:
-        before = found.get(row["outcome"], {"attempts": 0, "shards": 0, "most_on_one_shard": 0})
-        found[row["outcome"]] = row | {
-            "attempts": before["attempts"] + row["attempts"],
-            "shards": before["shards"] + row["shards"],
-            "most_on_one_shard": max(before["most_on_one_shard"], row["most_on_one_shard"]),
-        }
-    return [found[outcome] for outcome in sorted(found)]

@@ -25,7 +25,7 @@ from tests.small_runs import CONFIG
 
 pytestmark = pytest.mark.slow
 
-SCRIPT = Path(__file__).resolve().parents[2] / "cluster" / "deploy" / "slurm" / "datagen.sbatch"
+SCRIPT = Path(__file__).resolve().parents[2] / "datagen" / "cluster" / "deploy" / "slurm" / "datagen.sbatch"
 # A machine is its loopback address; Ray would give both the same port for an agent.
 SRUN = """#!/usr/bin/env bash
 while [[ "$1" == --* ]]; do

@@ -64,26 +64,6 @@ def test_a_job_on_a_real_run_leaves_commits_ledger_and_quarantine(tmp_path: Path
     assert summary.totals.useful_wall_s == pytest.approx(useful_s)
 
 
-def test_a_shard_that_another_driver_committed_is_superseded(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", shards=())
-    missing = run.missing()
-    run.commit(write(run, 2, "of-another-driver"))
-    assert missing == [0, 1, 2, 3, 4]
-
-    def commit(task: ScriptedTask, meter: Meter) -> AttemptResult:
-        written = write(run, task.shard, task.attempt)
-        return AttemptResult(run.commit(written), written.samples, written.positives, meter.cost())
-
-    def make_task(order: AttemptOrder) -> ScriptedTask:
-        return ScriptedTask(order.shard, order.attempt, 60, "")
-
-    summary = drive(
-        missing, make_task, InProcessExecutor(commit), RunRecorder(run), POLICY, Heard(), StopRequest()
-    )
-    assert summary.totals.committed == 4 and summary.totals.superseded == 1 and summary.end == "complete"
-    assert run.commit_of(2).attempt == "of-another-driver"
-
-
 def test_the_second_interrupt_breaks_into_the_running_shard(tmp_path: Path) -> None:
     begun: list[str] = []
 
@@ -120,7 +100,12 @@ def test_the_guard_reports_and_leaves_nothing_behind(tmp_path: Path) -> None:
 
     report = guarded(look, ScriptedTask(7, "a", 60, str(notes)), deadline=False)
     assert report.ends_job and report.outcome == "failed" and report.cause == "RUN: the disk is full"
-    assert isinstance(seen[0], Note) and seen[0].host.pid == os.getpid() and list(notes.iterdir()) == []
+    assert (
+        isinstance(seen[0], Note)
+        and seen[0].host is not None
+        and seen[0].host.pid == os.getpid()
+        and list(notes.iterdir()) == []
+    )
     gone = failure_report(ScriptedTask(7, "b", 60, str(notes)), "lost", "node gone")
     assert (gone.outcome, gone.cause, gone.cost, gone.started) == ("lost", "node gone", None, "")
     text = "ImportError: no module\n" + "a long story\n" * 100

@@ -40,12 +40,3 @@ def test_sums_are_over_all_runs() -> None:
     assert (whole.totals.shards, whole.totals.committed, whole.totals.labels) == (6, 4, 40)
     assert (whole.remaining, whole.elapsed_s) == (2, 4.0)
     assert (empty_summary().remaining, empty_summary().exit_code) == (0, 0)
-
-
-def test_only_the_first_shards_in_quarantine_are_named() -> None:
-    parts = [JobTotals(shards=30), JobTotals(shards=30)]
-    for totals in parts:
-        for shard in range(30):
-            totals.count_quarantined(shard)
-    both = parts[0].plus(parts[1])
-    assert both.quarantined == 60 and both.quarantined_shards == list(range(20))

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from datagen.cluster.preflight import MachineReport, inspect_machine, refuse_unfit_machines, versions_of
+from datagen.cluster.preflight import problem_here, refuse_unfit_machines
 from datagen.cluster.protocol import ShardTask
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
@@ -34,8 +34,8 @@ def one_machine(seen: ShardTask | None = None, **answered: Any) -> Ask:
     """A cluster of one other machine, which is this one, or sees other places, or answers as told."""
 
     def ask(function: Any, task: ShardTask, *arguments: Any, patience_s: float) -> dict[str, Any]:
-        assert function is inspect_machine and patience_s > 0
-        return {"192.0.2.7 (node abc)": answered.get("finding") or inspect_machine(seen or task, *arguments)}
+        assert function is problem_here and patience_s > 0
+        return {"192.0.2.7 (node abc)": answered.get("finding") or problem_here(seen or task, *arguments)}
 
     return ask
 
@@ -73,9 +73,10 @@ def test_another_folder_of_the_same_name_is_not_the_run(run: Run, tmp_path: Path
 
 
 def test_a_machine_with_other_versions_is_named(run: Run) -> None:
-    names = sorted(run.manifest.spec.engines)
-    here = versions_of(names)
-    assert here["numpy"] and here["scenes"] == ""
-    other = MachineReport("", {**here, "numpy": "1.0"})
-    with pytest.raises(InputError, match=r"numpy: is 1\.0 there, but .* Install"):
-        refuse_unfit_machines(one_machine(finding=other), run, task_of(run))
+    problem = problem_here(task_of(run), ".probe", {"numpy": "1.0"})
+    assert "is another folder" in problem  # a probe that is not there
+    run.storage.put_new(".probe", b"")
+    problem = problem_here(task_of(run), ".probe", {"numpy": "1.0", "scenes": ""})
+    run.storage.delete([".probe"])
+    with pytest.raises(InputError, match=r"numpy: is .* there, but 1\.0 on the .* Install"):
+        refuse_unfit_machines(one_machine(finding=problem), run, task_of(run))

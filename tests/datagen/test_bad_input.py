@@ -92,9 +92,7 @@ def test_a_set_of_candidates_that_their_number_contradicts(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    "address", ["127.0.0.1:1", "ray://127.0.0.1:1", "here", "", ":", "a:b", "127.0.0.1:99999"]
-)
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "here", "", ":", "a:b", "127.0.0.1:99999"])
 def test_a_cluster_that_is_not_there(
     address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

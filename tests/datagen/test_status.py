@@ -102,19 +102,12 @@ def test_status_lists_failures_stacks_and_quarantine(
     troubled: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     report = json_of(capsys, ["status", str(troubled), "--stacks"])
-    spent = {
-        row["outcome"]: (row["attempts"], row["most_on_one_shard"], row["budget"])
-        for row in report["budgets"]
-    }
-    assert spent == {
-        "crashed": (1, 1, 3), "failed": (1, 1, 3), "lost": (1, 1, 10), "out_of_memory": (1, 1, 2),
-    }  # fmt: skip
     assert report["quarantine"] == [{"shard": 1, "attempts": 2, "cause": "failed: ValueError: no rays"}]
     assert report["stacks"] == {f"crashed: {SEGFAULT}": STACK}
     assert report["shards"] == {"planned": 5, "committed": 3, "quarantined": [1], "missing": 1}
     assert cli.run(["status", str(troubled), "--stacks"]) == 0
     told = capsys.readouterr().out
-    for words in ("1 of 10", "line 3 in settle", "no rays", f"datagen resume {troubled} --quarantined"):
+    for words in ("lost 1", "line 3 in settle", "no rays", f"datagen resume {troubled} --quarantined"):
         assert words in told
 
 
