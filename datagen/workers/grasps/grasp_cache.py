@@ -17,7 +17,7 @@ from datagen.schemas.identity import digest_of
 from datagen.schemas.specification import GraspParams
 from datagen.workers.content_cache import CacheFolder
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.grasps.search import BLOCK, VERSION, HandPoses, hand_poses_of, score_block
+from datagen.workers.grasps.search import BLOCK, VERSION, HandPoses, hand_poses_of, score_block, score_poses
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.description import Gripper, Parts
 
@@ -27,7 +27,8 @@ class GraspSet:
     """G grasps, best first. The TCP frame is the gripper's (`datagen.workers.robots.description.Gripper`).
 
     Scores are shares of floating-hand pulls that held, 0 to 1. The scores of the first S grasps are known and
-    at least `min_score`. Each other score is computed on first use and may be lower.
+    at least `min_score`. Each other score is computed on first use and may be lower. `pose_score` gives that
+    of any pose (4, 4) in the object's frame and opening.
     """
 
     T_object_tcp: F64  # (G, 4, 4)
@@ -35,6 +36,7 @@ class GraspSet:
     score: F32  # (S,)
     min_score: float = 0.0
     later_score: Callable[[int], float] | None = None  # by row - S
+    pose_score: Callable[[F64, float], float] | None = None
 
     def __len__(self) -> int:
         return len(self.opening_m)
@@ -49,6 +51,17 @@ class GraspSet:
     def holds(self, row: int) -> bool:
         """Whether the grasp has at least `min_score`."""
         return row < len(self.score) or self.score_of(row) >= self.min_score
+
+    def with_poses(self, T_object_tcp: F64, opening_m: F64) -> GraspSet:
+        """Other poses (G, 4, 4) of the hand at the same object, none of them scored yet."""
+        pose_score = self.pose_score
+        assert pose_score is not None
+
+        def later_score(row: int) -> float:
+            return pose_score(T_object_tcp[row], float(opening_m[row]))
+
+        openings = opening_m.astype(np.float32)
+        return GraspSet(T_object_tcp, openings, self.score[:0], self.min_score, later_score, pose_score)
 
 
 Bools = npt.NDArray[np.bool_]
@@ -127,8 +140,17 @@ def grasps_of(model: ObjectModel, gripper: Gripper, params: GraspParams, draw: i
         search, row = later[k]
         return float(_score(known, digest, model, gripper, search, row // BLOCK)[row % BLOCK])
 
+    def pose_score(T_object_tcp: F64, opening_m: float) -> float:
+        rng = _generator([digest, T_object_tcp.tolist(), opening_m])
+        return float(score_poses(model, gripper, T_object_tcp[None], np.array([opening_m]), rng)[0])
+
     found = GraspSet(
-        np.concatenate(T), np.concatenate(openings), first.score[rows], params.min_score, later_score
+        np.concatenate(T),
+        np.concatenate(openings),
+        first.score[rows],
+        params.min_score,
+        later_score,
+        pose_score,
     )
     known.sets[key] = found
     return found

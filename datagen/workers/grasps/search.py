@@ -78,8 +78,14 @@ def score_block(
 ) -> F32:
     """Shares (n,) of the pulls that the poses of one block hold, n <= `BLOCK`."""
     rows = slice(block * BLOCK, (block + 1) * BLOCK)
-    T, opening_m = poses.T_object_tcp[rows], poses.opening_m[rows]
-    held = held_trials(model.convex_parts_m, model.mass_kg, gripper, T, opening_m, rng, HandTest())
+    return score_poses(model, gripper, poses.T_object_tcp[rows], poses.opening_m[rows], rng)
+
+
+def score_poses(
+    model: ObjectModel, gripper: Gripper, T_object_tcp: F64, opening_m: F64, rng: np.random.Generator
+) -> F32:
+    """Shares (n,) of the pulls that the hand holds at poses (n, 4, 4) with openings (n,)."""
+    held = held_trials(model.convex_parts_m, model.mass_kg, gripper, T_object_tcp, opening_m, rng, HandTest())
     return held.mean(axis=1).astype(np.float32)
 
 

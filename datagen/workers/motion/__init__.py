@@ -11,7 +11,7 @@ from datagen.workers.geometry.mesh import F64
 class MotionPlan:
     """Joint paths from a tucked pose to a lifted object. Neighbouring rows are joined by straight lines."""
 
-    grasp: int  # row of the scene's GraspSet
+    grasp: int  # row of the scene's GraspSet, or -1 for a pose near one of its grasps
     home: int  # row of the robot's homes_rad
     q_reach_rad: F64  # (M, A), home to pregrasp
     q_approach_rad: F64  # (K, A), pregrasp to grasp, along a straight line of the TCP
@@ -29,4 +29,4 @@ class PlanReport:
     outcome: str
     plan: MotionPlan | None
     grasps_free: int  # grasps of the target that the hand without an arm can reach in this scene
-    grasps_tried: int  # those for which IK was tried
+    grasps_tried: int  # those for which IK was tried, and poses near them

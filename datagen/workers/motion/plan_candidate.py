@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -14,6 +14,7 @@ from datagen.workers.motion.arm_collision import Surroundings, surroundings
 from datagen.workers.motion.collision import Ints
 from datagen.workers.motion.grasp_filter import backed, line_offsets_m, raised
 from datagen.workers.motion.grasp_goals import Goal, goals_of
+from datagen.workers.motion.nearby_poses import NearbyPoses, scene_with_poses
 from datagen.workers.motion.planning_scene import PlanningScene
 from datagen.workers.motion.rrt_connect import connect, dense, is_line_free, shortened, straight
 
@@ -24,18 +25,18 @@ _STARTS = 3  # tucked poses from which a straight line is tried
 _SEARCHES = 4  # grasps for which a path is searched where no straight path is free
 _SHORTCUTS = 20
 _CLEARANCE_POSES = 8
+# Poses in one round of the search near grasps, and the largest number of grasps that they are near.
+_NEARBY_POSES, _NEARBY_ORIGINS = 1200, 40
+_NEARBY_TRIED = 60  # poses of a round for which IK is tried
 _SAME_RAD = 0.05  # solutions of one grasp that differ by less count as one
 
 
 @dataclass(eq=False)
-class _Search:
-    """State of the search among some grasps for one candidate, shared by these grasps."""
+class _Base:
+    """A base pose in a scene."""
 
     scene: PlanningScene
     T_world_base: F64
-    far: list[_Reachable] = field(default_factory=list)  # without a free straight path
-    furthest: str = "no_ik"
-    tried: set[int] = field(default_factory=set)  # poses for which IK was tried
 
     @cached_property
     def T_base_world(self) -> F64:
@@ -45,9 +46,31 @@ class _Search:
     def at(self) -> Surroundings:
         return surroundings(self.scene, self.T_world_base)
 
-    def reached(self, stage: str) -> None:
-        """Record a stage that a grasp reached, if it is the furthest so far."""
-        self.furthest = max(self.furthest, stage, key=STAGES.index)
+
+@dataclass(eq=False)
+class _Search:
+    """State of the search among some grasps for one candidate, shared by these grasps."""
+
+    scene: PlanningScene
+    base: _Base
+    far: list[_Reachable] = field(default_factory=list)  # without a free straight path
+    furthest: str = "no_ik"
+    stages: dict[int, int] = field(default_factory=dict)  # of each grasp tried, in this order
+
+    @property
+    def at(self) -> Surroundings:
+        return self.base.at
+
+    def reached(self, stage: str, *grasps: int) -> None:
+        """Record a stage that some grasps reached, if it is the furthest so far."""
+        rank = STAGES.index(stage)
+        self.furthest = STAGES[max(STAGES.index(self.furthest), rank)]
+        for k in grasps:
+            self.stages[k] = max(self.stages.get(k, 0), rank)
+
+    def best(self, count: int) -> list[int]:
+        """At most `count` of the grasps tried, those that came furthest first."""
+        return sorted(self.stages, key=lambda k: -self.stages[k])[:count]
 
     def holds(self, k: int) -> bool:
         """Whether the hand holds the object in kept grasp `k`; simulated on first use."""
@@ -79,15 +102,19 @@ def plan_candidate(
     """Search for a whole plan from the base pose (4, 4) to any grasp except those in `skip`.
 
     `skip` are rows of the GraspSet. The result depends on the arguments alone: neither on earlier candidates
-    nor on time. `rng` is used only where no grasp has a straight path.
+    nor on time. `rng` is used only where no grasp has a straight path. With `nearby_rounds`, poses near the
+    grasps that came furthest follow; `grasp` of such a plan is -1.
     """
     around = prepared.around
     kept, rest = (rows[~np.isin(around.grasp[rows], sorted(skip))] for rows in (around.kept, around.rest))
     if around.grasps_free == 0 or len(kept) + len(rest) == 0:
         return PlanReport("no_grasp", None, around.grasps_free, 0)
-    search = _Search(prepared, T_world_base)
+    search = _Search(prepared, _Base(prepared, T_world_base))
     plan = _search_grasps(search, kept, rest, prepared.params.max_grasps_tried, rng)
-    tried = len(np.unique(around.grasp[sorted(search.tried)]))
+    tried = len(np.unique(around.grasp[list(search.stages)]))
+    if plan is None and prepared.params.nearby_rounds:
+        plan, more = _search_nearby(search, rng)
+        tried += more
     outcome = search.furthest if plan is None else "success"
     return PlanReport(outcome, plan, around.grasps_free, tried)
 
@@ -96,12 +123,34 @@ def _search_grasps(
     search: _Search, kept: Ints, rest: Ints, most: int, rng: np.random.Generator
 ) -> MotionPlan | None:
     """Search for a plan to at most `most` of the free poses `kept` and `rest`."""
-    for goals in goals_of(search.scene, search.T_base_world, kept, rest, most):
-        search.tried.update(goal.k for goal in goals)
+    for goals in goals_of(search.scene, search.base.T_base_world, kept, rest, most):
+        search.reached("no_ik", *(goal.k for goal in goals))
         plan = _try_goals(search, goals)
         if plan is not None or search.furthest == "no_start":
             return plan
     return _search_paths(search, rng)
+
+
+def _search_nearby(first: _Search, rng: np.random.Generator) -> tuple[MotionPlan | None, int]:
+    """Search near the grasps that came furthest, then near the best poses found; also the number tried."""
+    scene, tried, search = first.scene, 0, first
+    near = NearbyPoses.of_grasps(scene.around.T_world_tcp, scene.around.opening_m)
+    origins = first.best(_NEARBY_ORIGINS) or scene.around.kept[:_NEARBY_ORIGINS].tolist()
+    for _ in range(scene.params.nearby_rounds or 0):
+        if not origins or search.furthest == "no_start" or search.at.is_base_stuck:
+            break
+        near = near.rows(np.array(origins)).varied(_NEARBY_POSES // len(origins), rng)
+        around = scene_with_poses(scene.around, near.T_world_tcp(), near.opening_m, scene.params)
+        search = _Search(replace(scene, around=around), first.base)
+        plan = _search_grasps(search, around.kept, around.rest, _NEARBY_TRIED, rng)
+        first.reached(search.furthest)
+        tried += len(search.stages)
+        if plan is not None:
+            return replace(plan, grasp=-1), tried
+        if search.furthest == "arm_collision":  # further rounds hardly ever lead out of a collision
+            break
+        origins = search.best(_NEARBY_ORIGINS)
+    return None, tried
 
 
 def _try_goals(search: _Search, goals: list[Goal]) -> MotionPlan | None:
@@ -114,7 +163,7 @@ def _try_goals(search: _Search, goals: list[Goal]) -> MotionPlan | None:
     ways = [way for goal in goals for way in _ways(search.scene, goal)]
     if not ways:
         return None
-    search.reached("arm_collision")
+    search.reached("arm_collision", *(way.goal.k for way in ways))
     at = search.at
     if at.is_base_stuck:
         return None
@@ -153,24 +202,24 @@ def _try_way(search: _Search, way: _Way) -> MotionPlan | None:
     k, T_base_tcp = way.goal.k, way.goal.T_base_tcp
     T_up = np.stack(
         [
-            search.T_base_world @ raised(scene.around.T_world_tcp[k], float(r))
+            search.base.T_base_world @ raised(scene.around.T_world_tcp[k], float(r))
             for r in line_offsets_m(params.lift_m)
         ]
     )
-    search.reached("no_approach")
+    search.reached("no_approach", k)
     T_back = np.stack([backed(T_base_tcp, float(b)) for b in line_offsets_m(params.pregrasp_m)])
     # The end of the lift is checked first: where the arm is too short for it, the lines cost most.
     if way.goal.limit == "no_lift" or robot.ik(T_up[-1], way.q_grasp) is None:
-        search.reached("no_lift")
+        search.reached("no_lift", k)
         return None
     back = follow_line(at, T_back, way.q_grasp, way.q_pregrasp, is_target_held=False)
     if back is None:
         return None
-    search.reached("no_lift")
+    search.reached("no_lift", k)
     lift = follow_line(at, T_up, way.q_grasp, None, is_target_held=True)
     if lift is None:
         return None
-    search.reached("no_path")
+    search.reached("no_path", k)
     homes, opening_m = at.free_homes, float(scene.around.opening_m[k])
     gaps = np.linalg.norm(robot.homes_rad[homes] - way.q_pregrasp, axis=1)
     found = _Reachable(k, back[::-1], lift, homes[np.argsort(gaps, kind="stable")])
