@@ -129,9 +129,7 @@ def relabel_all(
 
 def _open_target(storage: Storage, source: Run, spec: Specification) -> Run:
     known = source.manifest.sources
-    manifest = manifest_of(
-        spec, source.layout, {**known, "scenes_from": source.storage.url}, source.manifest.schema_version
-    )
+    manifest = manifest_of(spec, source.layout, {**known, "scenes_from": source.storage.url})
     run = Run.create_or_open(storage, manifest, source.n)
     if run.layout != source.layout:
         problem = f"is {run.layout.scenes_per_shard}, unlike in the source"

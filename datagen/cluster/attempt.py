@@ -34,7 +34,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
         if run.storage.exists(commit_key(task.shard)):  # by another driver, while this attempt was queued
             return AttemptResult(False, 0, 0, meter.cost())
     stored = None if scenes_run is None else list(read_scenes(scenes_run, task.scene_indices))
-    made = run_shard(task.spec, world, task.scene_indices, stored, run.schema.version)
+    made = run_shard(task.spec, world, task.scene_indices, stored)
     with ends_job(), made.clock.stage("write"):
         files = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
         with run.nothing_left_behind(task.shard, task.attempt):

@@ -196,7 +196,7 @@ def _specified(options: SubmitOptions) -> tuple[Run | None, Manifest]:
         refuse_unusable_engines(spec, options.address)
         if run is None:
             _refuse_no_scene(world, houses)
-        layout, schema_version, stored_in = layout_of(spec, options.n), None, {}
+        layout, stored_in = layout_of(spec, options.n), {}
     else:
         given = given_options(options)
         stored = open_stored_scenes(
@@ -211,7 +211,6 @@ def _specified(options: SubmitOptions) -> tuple[Run | None, Manifest]:
         refuse_unusable_engines(spec, options.address)
         layout = layout_again(spec, stored, options.n) if run is None else run.layout
         refuse_too_few(stored, layout, options.n)
-        schema_version = stored.run.manifest.schema_version
         stored_in = {"scenes_from": stored.run.storage.url}
     sources = {
         "houses": absolute_source(houses),
@@ -219,7 +218,7 @@ def _specified(options: SubmitOptions) -> tuple[Run | None, Manifest]:
         "n_houses": str(len(world.house_ids)),
         "n_objects": str(len(world.object_names)),
     }
-    manifest = manifest_of(spec, layout, sources | stored_in, schema_version)
+    manifest = manifest_of(spec, layout, sources | stored_in)
     if run is not None:
         refuse_other(run.storage.url, run.manifest, manifest)
     return run, manifest

@@ -144,17 +144,14 @@ def layout_of(spec: Specification, n: int) -> Layout:
     return Layout(scenes_per_shard=even, candidates_per_scene=spec.candidates.count)
 
 
-def manifest_of(
-    spec: Specification, layout: Layout, sources: dict[str, str], schema_version: int | None = None
-) -> Manifest:
-    """The manifest of a new run; `schema_version` is that of the run whose scenes are labelled."""
+def manifest_of(spec: Specification, layout: Layout, sources: dict[str, str]) -> Manifest:
+    """The manifest of a new run."""
     source = load_label_source(spec.label_source)
-    newest = SCHEMAS[source.schema].version
     return Manifest(
         spec=spec,
         spec_hash=spec.hash(),
         schema_name=source.schema,
-        schema_version=newest if schema_version is None else min(schema_version, newest),
+        schema_version=SCHEMAS[source.schema].version,
         layout=layout,
         code_version=__version__,
         libraries={name: found for name, found in versions_of(_LIBRARIES).items() if found}

@@ -19,9 +19,8 @@ from datagen.schemas.specification import Specification
 Table = Literal["scene", "sample"]
 TABLES: tuple[Table, Table] = ("scene", "sample")
 
-# Version of all schemas. New fields raise it and note it in `since`; fields are never removed or changed.
+# Version of all schemas: another one is not read.
 SCHEMA_VERSION = 4
-OLDEST_SCHEMA_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -29,8 +28,7 @@ class Field:
     """One array of a store.
 
     `dims` names the axes after the table's own ("scene" or "sample"); `RecordSchema.sizes` has their lengths.
-    `low` and `high` bound every finite value (closed interval). `since` is the first schema version with the
-    field: runs of older versions do not have it.
+    `low` and `high` bound every finite value (closed interval).
     """
 
     name: str
@@ -42,7 +40,6 @@ class Field:
     low: float | None = None
     high: float | None = None
     codes: tuple[str, ...] = ()  # meanings of the values 0, 1, ...
-    since: int = OLDEST_SCHEMA_VERSION
 
     @property
     def is_text(self) -> bool:
@@ -51,17 +48,13 @@ class Field:
 
 @dataclass(frozen=True)
 class RecordSchema:
-    """The arrays of one label source and the lengths of their axes.
-
-    `later` names the fields of newer versions, which are computed but not stored.
-    """
+    """The arrays of one label source and the lengths of their axes."""
 
     name: str
     version: int
     scene_fields: tuple[Field, ...]
     sample_fields: tuple[Field, ...]
     sizes: Mapping[str, int] = field(default_factory=dict, hash=False)
-    later: frozenset[str] = frozenset()
 
     def table(self, table: Table) -> tuple[Field, ...]:
         return self.scene_fields if table == "scene" else self.sample_fields
@@ -77,11 +70,6 @@ class RecordSchema:
     def sized(self, **sizes: int) -> RecordSchema:
         """The schema with axis lengths of one specification (points, objects)."""
         return replace(self, sizes={**self.sizes, **sizes})
-
-    def at(self, version: int) -> RecordSchema:
-        scene, sample = (tuple(f for f in self.table(t) if f.since <= version) for t in TABLES)
-        later = frozenset(f.name for _, f in self.fields if f.since > version)
-        return replace(self, version=version, scene_fields=scene, sample_fields=sample, later=later)
 
     def check(self, table: Table, rows: int, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Raise InputError for a batch with missing or unknown fields, or a wrong dtype, shape or range."""
@@ -205,9 +193,8 @@ PLAN_FIELDS = (
     *_PLANNED_FIELDS,
     Field("trials", "int16", (), "1", "",
           "arrivals that were planned from: repeats, or 1, the candidate itself; 0 where nothing was planned",
-          0, since=4),
-    Field("successes", "int16", (), "1", "", "those with a whole plan; the label is the candidate's own",
-          0, since=4),
+          0),
+    Field("successes", "int16", (), "1", "", "those with a whole plan; the label is the candidate's own", 0),
 )
 
 SIM_FIELDS = (
@@ -221,7 +208,7 @@ SIM_FIELDS = (
     Field("simulated_s", "float32", (), "s", "", "simulated time of all executions", 0, 1e6),
     Field("retry_outcome", "uint8", (), "1", "",
           "outcome of the last execution after a first that failed; the label is the first's",
-          0, len(RETRY_OUTCOMES) - 1, RETRY_OUTCOMES, since=3),
+          0, len(RETRY_OUTCOMES) - 1, RETRY_OUTCOMES),
 )
 # fmt: on
 
@@ -237,21 +224,8 @@ SCHEMAS: dict[str, RecordSchema] = {
 }
 
 
-def sized_schema(name: str, spec: Specification, version: int | None = None) -> RecordSchema:
-    """Return the named schema with the specification's axis lengths, as of `version` (default: the newest).
-
-    InputError for an unknown name or version.
-    """
+def sized_schema(name: str, spec: Specification) -> RecordSchema:
+    """Return the named schema with the specification's axis lengths. InputError for an unknown name."""
     if name not in SCHEMAS:
         raise InputError("specification", "label_source", f"no record schema {name!r}", choices(SCHEMAS))
-    schema = SCHEMAS[name]
-    if version is not None and version != schema.version:
-        if not OLDEST_SCHEMA_VERSION <= version < schema.version:
-            raise InputError(
-                name,
-                "schema_version",
-                f"is {version}, but this program reads {OLDEST_SCHEMA_VERSION} to {schema.version}",
-                "Use the version of the program that made the run, or start a new run",
-            )
-        schema = schema.at(version)
-    return schema.sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter)
+    return SCHEMAS[name].sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter)

@@ -131,7 +131,6 @@ def refuse_foreign(storage: Storage, *also: str) -> None:
 
 def refuse_other(place: str, stored: Manifest, given: Manifest) -> None:
     """Raise InputError for a run of another specification, with every field that differs."""
-    # Without the schema version: a run keeps the one it was started with.
     ours, theirs = (
         {"spec": one.spec.model_dump(mode="json"), "schema_name": one.schema_name} for one in (given, stored)
     )

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import RecordSchema, sized_schema
+from datagen.schemas.fields import SCHEMA_VERSION, RecordSchema, sized_schema
 from datagen.schemas.keys import (
     MERGED,
     commit_copy_key,
@@ -108,15 +108,15 @@ class Run:
 
     @property
     def schema(self) -> RecordSchema:
-        """The record schema of this run's version, with its axis lengths.
-
-        A run keeps the version it was started with. InputError for an unknown one.
-        """
-        manifest = self.manifest
+        """The record schema with the run's axis lengths. InputError for an unknown one."""
+        manifest, place = self.manifest, f"{self.storage.url}/manifest.json"
+        if manifest.schema_version != SCHEMA_VERSION:
+            problem = f"is {manifest.schema_version}, but this program reads {SCHEMA_VERSION}"
+            raise InputError(place, "schema_version", problem, "Use the version of datagen that made the run")
         try:
-            return sized_schema(manifest.schema_name, manifest.spec, manifest.schema_version)
+            return sized_schema(manifest.schema_name, manifest.spec)
         except InputError as e:
-            raise InputError(f"{self.storage.url}/manifest.json", e.field, e.problem, e.fix) from e
+            raise InputError(place, e.field, e.problem, e.fix) from e
 
     # Plans: the number of samples wanted.
 

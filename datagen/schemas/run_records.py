@@ -13,7 +13,6 @@ from pydantic import (
     ConfigDict,
     Field,
     SerializerFunctionWrapHandler,
-    field_serializer,
     model_serializer,
 )
 
@@ -85,11 +84,6 @@ class Manifest(StoredRecord):
         robot = f"robot {spec.arm.robot}" if spec.arm else "sampled robots"
         return ", ".join(part.strip() for part in (houses, objects, robot))
 
-    @field_serializer("spec")
-    def _as_stored(self, spec: Specification) -> dict[str, Any]:
-        """Keeps the fields under the hash when a merge writes the manifest again."""
-        return spec.document()
-
 
 class Plan(StoredRecord):
     """plans/<k>.json: the number of samples wanted. The newest counts; a run only grows."""
@@ -140,7 +134,7 @@ class Cost(StoredRecord):
 
     @model_serializer(mode="wrap")
     def _without_empty_source(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit `source_s` where empty: records keep the bytes from before the field existed."""
+        """Omit `source_s` where empty."""
         return {name: value for name, value in plain(self).items() if name != "source_s" or value}
 
     @property

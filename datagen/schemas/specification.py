@@ -6,11 +6,11 @@ scenes, of which a run makes the first n samples.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from datagen.schemas.identity import digest_of
 
@@ -23,13 +23,6 @@ Fraction = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-    @model_validator(mode="after")
-    def _all_set(self, info: ValidationInfo) -> Self:
-        # After this, the only unset fields are those of later versions, which a stored record lacks.
-        if info.mode != "json":
-            self.model_fields_set.update(type(self).model_fields)
-        return self
 
 
 class Source(_Frozen):
@@ -122,10 +115,10 @@ class CandidateParams(_Frozen):
     camera_height_m: Range = Range(low=0.8, high=1.5)
     base_height_m: Range = Range(low=0.5, high=1.0)
     arm_reach_m: Range = Range(low=0.3, high=1.0)
-    # Reaches are sampled in whole steps, so that workers open few arms; 0, as in older runs: any reach.
+    # Reaches are sampled in whole steps, so that workers open few arms; 0: any reach.
     arm_reach_step_m: float = Field(default=0.0, ge=0, le=0.1)
     base_radius_m: Metres = 0.25
-    # Bases of arms shorter than the Panda are narrower in proportion; None, as in older runs: all alike.
+    # Bases of arms shorter than the Panda are narrower in proportion; None: all alike.
     scaled_base: bool | None = None
     mast_radius_m: Metres = 0.05
 
@@ -288,17 +281,13 @@ class Specification(_Frozen):
     # Versions of the label code and of the engines that can change bits, by name.
     engines: dict[str, str] = Field(default_factory=dict)
 
-    def document(self, without_none: bool = False) -> dict[str, Any]:
-        """The fields as stored; for a specification from a record, only those of the record."""
-        return self.model_dump(mode="json", exclude_unset=True, exclude_none=without_none)
+    def document(self) -> dict[str, Any]:
+        """The fields as stored."""
+        return self.model_dump(mode="json")
 
     def hash(self) -> str:
-        """sha256 of the canonical JSON: the identity of the sequence of samples.
-
-        Fields that are None or missing in the record are omitted, so that later fields do not change older
-        hashes.
-        """
-        return digest_of(self.document(without_none=True))
+        """sha256 of the canonical JSON: the identity of the sequence of samples. None is omitted."""
+        return digest_of(self.model_dump(mode="json", exclude_none=True))
 
     @property
     def scenes_hash(self) -> str:

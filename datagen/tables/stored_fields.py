@@ -21,7 +21,7 @@ def fields_of(paths: Sequence[str | Path], function: str) -> list[dict[str, tupl
 def _fields_of(path: str | Path) -> dict[str, tuple[Table, Field]]:
     if is_sealed_store(path):
         sealed = open_sealed(path, ("scene_index", "sample_scene_index"))
-        schema = SCHEMAS[sealed.schema].at(sealed.schema_version)
+        schema = SCHEMAS[sealed.schema]
     else:
         schema = open_runs(str(path))[0].schema
     return {field.name: (table, field) for table, field in schema.fields}

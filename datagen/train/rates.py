@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from datagen.schemas.fields import sized_schema
+from datagen.schemas.fields import SCHEMAS
 from datagen.train.inputs import Batch
 from datagen.train.run_parts import RunPart
 
@@ -19,10 +19,7 @@ def rate_fields(parts: Sequence[RunPart]) -> tuple[str, ...]:
     """`RATE_FIELDS` where a run's trials are disturbed and all runs hold them; else (), to use labels."""
     disturbed = any(spec.arm is not None and spec.arm.disturbance for part in parts for spec in part.specs)
     held = all(
-        set(RATE_FIELDS)
-        <= {field.name for field in sized_schema(part.schema, spec, part.schema_version).sample_fields}
-        for part in parts
-        for spec in part.specs
+        set(RATE_FIELDS) <= {field.name for field in SCHEMAS[part.schema].sample_fields} for part in parts
     )
     return RATE_FIELDS if disturbed and held else ()
 

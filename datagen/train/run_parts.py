@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.schemas.errors import InputError, choices
-from datagen.schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMAS
+from datagen.schemas.fields import SCHEMA_VERSION, SCHEMAS
 from datagen.schemas.keys import MERGED
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
@@ -165,9 +165,8 @@ def open_sealed(path: Path | str, names: Sequence[str]) -> RunPart:
         specs = tuple(Specification.model_validate_json(json.dumps(part["specification"])) for part in runs)
     except (ValueError, KeyError, TypeError, RecursionError) as e:
         raise InputError(where, "", f"is not the root of a sealed store ({e})", _SEALED_FIX) from e
-    if schema not in SCHEMAS or not OLDEST_SCHEMA_VERSION <= version <= SCHEMAS[schema].version:
-        known = ", ".join(f"{s.name} {OLDEST_SCHEMA_VERSION} to {s.version}" for s in SCHEMAS.values())
-        problem = f"is {schema!r} {version}, but this program reads {known}"
+    if schema not in SCHEMAS or version != SCHEMA_VERSION:
+        problem = f"is {schema!r} {version}, but this program reads {', '.join(SCHEMAS)} {SCHEMA_VERSION}"
         raise InputError(where, "schema_version", problem, "Use the version of datagen that made the run")
     _refuse_unknown(storage.url, names, stored)
     arrays = ShardPlace(storage, "", 0, 0, 0, 0, 0).metadata(names)

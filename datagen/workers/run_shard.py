@@ -49,16 +49,15 @@ def run_shard(
     world: World,
     scene_indices: Sequence[int],
     stored: Iterable[SceneRows] | None = None,
-    schema_version: int | None = None,
 ) -> ShardResult:
     """Generate the scenes of these indices, or read them from `stored`, and label their candidates.
 
     The same specification and index give the same bytes, whatever else is in the shard. Stored
-    scenes keep their bytes. Fields that an older `schema_version` lacks are left out. Raises InputError
+    scenes keep their bytes. Raises InputError
     if a stored scene does not match its index, or its house and objects are not those of the world.
     """
     source, spec_hash = load_label_source(spec.label_source), spec.hash()
-    schema = sized_schema(source.schema, spec, schema_version)
+    schema = sized_schema(source.schema, spec)
     clock, redraws = StageClock(), Counter[str]()
     scene_rows: list[Mapping[str, Any]] = []
     sample_blocks: list[Columns] = []
@@ -78,9 +77,7 @@ def run_shard(
     scene_columns = {
         f.name: _stack(f.dtype, [row[f.name] for row in scene_rows]) for f in schema.scene_fields
     }
-    # All other columns of the source: the check below rejects one that no schema version has.
-    names = [name for name in sample_blocks[0] if name not in schema.later]
-    sample_columns = {name: np.concatenate([b[name] for b in sample_blocks]) for name in names}
+    sample_columns = {name: np.concatenate([b[name] for b in sample_blocks]) for name in sample_blocks[0]}
     schema.check("scene", len(scene_rows), scene_columns)
     schema.check("sample", sum(len(b["label"]) for b in sample_blocks), sample_columns)
     return ShardResult(scene_columns, sample_columns, clock, dict(redraws))

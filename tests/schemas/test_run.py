@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SCHEMA_VERSION
 from datagen.schemas.record_files import copy_key, publish, signed_json
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import FileEntry, Layout, LedgerEntry, QuarantineRecord
@@ -242,7 +243,7 @@ def test_runs_of_other_formats_and_versions_are_refused(tmp_path: Path):
     edit(tmp_path / "manifest.json", format_version=2, schema_version=99)
     with pytest.raises(InputError, match="schema_version"):
         _ = Run.open(tmp_path).schema
-    edit(tmp_path / "manifest.json", schema_name="dreams")
+    edit(tmp_path / "manifest.json", schema_version=SCHEMA_VERSION, schema_name="dreams")
     with pytest.raises(InputError, match="dreams"):
         _ = Run.open(tmp_path).schema
 

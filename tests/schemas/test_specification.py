@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
@@ -82,14 +81,6 @@ def test_bases_are_scaled_below_the_reach_of_the_panda(reach_m: float, radius_m:
     assert alike.radius_of_base_m(reach_m) == radius_m
     assert scaled.radius_of_base_m(reach_m) == pytest.approx(radius_m * min(1.0, reach_m / 0.855))
     np.testing.assert_array_equal(scaled.radius_of_base_m(np.array([0.855, 1.0])), [radius_m, radius_m])
-
-
-def test_a_record_without_the_field_has_bases_of_one_size_and_keeps_its_hash() -> None:
-    record = SPEC.document()
-    del record["candidates"]["scaled_base"]
-    stored = Specification.model_validate_json(json.dumps(record))
-    assert stored.candidates.radius_of_base_m(0.4) == 0.25
-    assert stored.hash() == SPEC.hash()
 
 
 def test_it_cannot_be_changed() -> None:

@@ -16,7 +16,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, commit_copy_key, commit_key, part_folder
 from datagen.schemas.record_files import encode_record, signed_json
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Merged, Plan, QuarantineRecord
+from datagen.schemas.run_records import Cost, Merged, Plan, QuarantineRecord
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import open_storage
 from tests.faults.damage_campaign import fewer_arrays
@@ -211,7 +211,7 @@ def test_a_damaged_end_record_without_a_commit_is_set_aside(sealed: Run):
 
 
 def test_stages_that_take_longer_than_their_attempt(sealed: Run):
-    cost = {"wall_s": 2.0, "cpu_s": 1.0, "stage_wall_s": {"draw": 1.5, "settle": 1.0}}
+    cost = Cost(wall_s=2.0, cpu_s=1.0, stage_wall_s={"draw": 1.5, "settle": 1.0}).model_dump(mode="json")
     edit(folder_of(sealed) / "ledger/x-1.json", cost=cost)
     (finding,), _ = check(folder_of(sealed))
     assert finding.kind == "account" and "2.5 s" in finding.problem

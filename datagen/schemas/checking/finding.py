@@ -110,7 +110,7 @@ def read(
         record = decode_record(key, data, model)
     except InputError as error:
         return Read(key, data, None, f"{error.field}: {error.problem}" if error.field else error.problem)
-    if signed_json(record.model_dump(mode="json", exclude_unset=True)) != data:
+    if signed_json(record.model_dump(mode="json")) != data:
         return Read(key, data, None, "signed, but not in the form that datagen writes")
     problem = refuse(record)
     return Read(key, data, None if problem else record, problem)
