@@ -109,5 +109,5 @@ def _best(prediction: Prediction) -> list[dict[str, Any]]:
 
 def _at(points_m: F64) -> dict[str, Any]:
     """Points (N, 3) as plotly's coordinates; nan ends a line."""
-    columns = np.where(np.isnan(points_m), None, np.round(points_m, 4)).T.tolist()
+    columns = [[None if np.isnan(v) else round(float(v), 4) for v in column] for column in points_m.T]
     return dict(zip("xyz", columns, strict=True))
