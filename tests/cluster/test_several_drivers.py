@@ -9,66 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.protocol import StopRequest
 from datagen.cluster.shard_policy import OpenShards
 from datagen.schemas.shard_ranges import ShardRanges
 from tests.cluster.several_drivers import drive_together, waste
-from tests.cluster.simulated import LENIENT, FakeClock, Fate, Heard, PaperRecorder, SimulatedExecutor
-
-
-class Other:
-    """Another driver with as many slots, begun at the same moment: it goes through the shards in order."""
-
-    def __init__(self, clock: FakeClock, shards: int, slots: int) -> None:
-        self.clock, self.shards, self.slots = clock, shards, slots
-        self.done: set[int] = set()
-        self.ours: set[int] = set()
-        self.at, self.step_s = 0, 0.0
-
-    def advance(self) -> None:
-        while self.step_s + 5.0 <= self.clock.now_s:
-            self.step_s += 5.0
-            for _ in range(self.slots):
-                while self.at in self.ours:
-                    self.at += 1
-                if self.at < self.shards:
-                    self.done.add(self.at)
-                    self.at += 1
-
-    def fate(self, order: AttemptOrder, n: int) -> Fate:
-        self.advance()
-        if order.shard in self.done:
-            return ("superseded", 0.01)
-        if self.at <= order.shard < self.at + self.slots:  # at work there now
-            return ("superseded", 5.0)
-        self.ours.add(order.shard)
-        return ("committed", 5.0)
-
-
-@pytest.mark.parametrize("shards", [40, 400, 4000])
-def test_a_driver_makes_way_for_another(shards: int) -> None:
-    clock = FakeClock()
-    other = Other(clock, shards, slots=4)
-
-    class SharedBooks(PaperRecorder):
-        def missing(self) -> ShardRanges:
-            other.advance()
-            return ShardRanges.of(range(shards)).without(ShardRanges.of(other.done | other.ours))
-
-    recorder = SharedBooks()
-    executor = SimulatedExecutor(clock, other.fate, slots=4)
-    summary = drive(range(shards), lambda o: o, executor, recorder, LENIENT, Heard(), StopRequest(), clock)
-    totals = summary.totals
-    assert summary.end == "complete" and summary.remaining == 0
-    clock.now_s += 5.0 * shards  # what the other is at work at counts as done here
-    other.advance()
-    assert totals.committed == len(other.ours) and other.done | other.ours == set(range(shards))
-    assert totals.committed + totals.superseded + totals.elsewhere == shards
-    # Places are drawn at random. Over few shards the two may meet until the end; over many they share them.
-    assert shards == 40 or totals.committed > shards // 3
-    # Twice the first window, and some more wherever the two met: no longer everything.
-    assert shards == 40 or totals.wasted_wall_s <= 5.0 * (64 + shards // 50)
 
 
 @given(st.sets(st.integers(0, 80)), st.integers(0, 2**32), st.lists(st.integers(0, 3), max_size=80))

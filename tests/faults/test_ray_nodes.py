@@ -12,23 +12,18 @@ import pytest
 from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.preflight import refuse_unfit_machines
-from datagen.cluster.protocol import JobTotals, ShardTask, StopRequest
+from datagen.cluster.protocol import ShardTask, StopRequest
 from datagen.cluster.ray_cluster import RaySettings, forget_former_token, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
 from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, head_environment, new_token
-from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from tests.cluster.simulated import Heard, PaperRecorder
-from tests.faults.job import RandomRows, make_rows
 from tests.faults.scripted import ScriptedTask, perform
-from tests.made_runs import check_digests, make_run
 from tests.small_runs import make_small_run
 
 pytestmark = pytest.mark.slow
-
-POLICY = RetryPolicy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=60)
 
 
 @dataclass
@@ -123,41 +118,3 @@ def test_a_machine_that_does_not_see_the_run_is_named(
     assert str(told.value).startswith(f"machine {second}: ") and "no such folder" in str(told.value)
     (machines.folder / "second" / "home" / "run").symlink_to(tmp_path / "run")
     refuse_unfit_machines(executor.others.ask, run, task)
-
-
-def test_a_machine_that_goes_takes_nothing_with_it(machines: Machines, tmp_path: Path) -> None:
-    run, slots = make_run(tmp_path / "run", n=8 * 10, shards=()), machines.cluster
-    undisturbed = make_run(tmp_path / "undisturbed", n=8 * 10)
-    executor = RayExecutor(make_rows, machines.settings, machines.ray)
-    gone: list[str] = []
-
-    with notes_of_a_job() as notes:
-
-        def second_is_at_work() -> bool:
-            return any((machines.folder / "second" / "tmp" / notes).glob("*.stack"))
-
-        def kill_the_second(totals: JobTotals) -> None:
-            if not gone and totals.committed >= 2 and second_is_at_work():
-                gone.append("second")
-                slots.remove_node(machines.second, allow_graceful=False)
-
-        def make_task(order: AttemptOrder) -> RandomRows:
-            # Long enough that the machine is gone before what it is at is done.
-            return RandomRows(run.storage.url, 4.0, order.shard, order.attempt, order.deadline_s, notes)
-
-        heard = Heard(on_tick=kill_the_second)
-        summary = drive(run.missing(), make_task, executor, RunRecorder(run), POLICY, heard, StopRequest())
-        executor.close()
-    assert gone and summary.end == "complete" and run.committed() == set(range(8))
-    assert close_lost_attempts(run) == 0
-    outcomes = [e.outcome for e in run.ledger.ends()]
-    assert outcomes.count("committed") == 8 and set(outcomes) == {"committed", "lost"}
-    assert run.quarantined() == set()
-    assert files_of_shards(run) == files_of_shards(undisturbed)
-
-
-def files_of_shards(run: Run) -> dict[int, list[tuple[str, str]]]:
-    """Names and digests of every committed file, checked against the disk."""
-    for shard in run.committed():
-        check_digests(run, run.commit_of(shard))
-    return {s: sorted((f.path, f.sha256) for f in run.commit_of(s).files) for s in run.committed()}

@@ -17,9 +17,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from datagen.cluster.ray_cluster import refuse_unusable
 from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, free_port, new_token
-from datagen.schemas.errors import InputError
 from tests.made_runs import check_digests, make_run
 
 pytestmark = pytest.mark.slow
@@ -102,25 +100,6 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
             if machine.is_running():
                 kill_machine(machine)
         shutil.rmtree(session, ignore_errors=True)
-
-
-def test_only_those_who_know_the_token_are_let_in(
-    cluster: Cluster, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(InputError, match=r"requires a token, but none is set\. Set RAY_AUTH_TOKEN"):
-        refuse_unusable(cluster.address)
-    (tmp_path / ".ray").mkdir()
-    (tmp_path / ".ray" / "auth_token").write_text("another")
-    with pytest.raises(InputError, match=r"refuses the token in .*auth_token\. Set RAY_AUTH_TOKEN"):
-        refuse_unusable(cluster.address)
-    monkeypatch.setenv("RAY_AUTH_TOKEN_PATH", str(tmp_path))
-    with pytest.raises(InputError, match="cannot be read"):
-        refuse_unusable(cluster.address)
-    monkeypatch.setenv("RAY_AUTH_TOKEN", cluster.token)
-    refuse_unusable(cluster.address)
 
 
 def test_a_job_outlives_a_machine_whose_power_goes(cluster: Cluster, tmp_path: Path) -> None:
