@@ -19,17 +19,14 @@ SCRIPT = Path(__file__).resolve().parent.parent / "scripts" / "paper.sh"
 # inputs that nobody made, and makes what is asked for, empty.
 NOTING = """#!/bin/bash
 printf '%q ' "$@" >> "$NOTES"; echo >> "$NOTES"
-made=; json=
+made=
 while [ $# -gt 0 ]; do
     case $1 in
     --out) made=$2; shift ;;
-    --html) echo page > "$2"; shift ;;
-    --json) json={} ;;
     */runs/*|*.ckpt|*.toml) [ -e "$1" ] || { echo "nobody made $1" >&2; exit 2; } ;;
     esac
     shift
 done
-echo $json
 [ -n "$made" ] && ! [ -e "$made" ] || exit 0
 case $made in */runs/*) mkdir "$made" ;; *) echo made > "$made" ;; esac
 """
@@ -71,7 +68,7 @@ def test_its_commands_are_ours_and_the_slow_ones_are_not_repeated(place: Path, s
     trained = {word for words in called if words[0] == "train" for word in words}
     for run, split in splits.items():
         assert (run in trained) == (split != "test" and not run.endswith("heuristic")), run
-    assert (place / "out" / "tables.json").read_text() == "{}\n"
+    assert (place / "out" / "tables.json").is_file()
 
     (place / "notes").unlink()
     assert tell(place, size, "out", DATAGEN_ASSETS="assets").returncode == 0

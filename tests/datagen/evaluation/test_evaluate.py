@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,14 @@ import pytest
 import torch
 
 from datagen import cli
-from datagen.evaluation.methods import open_models
+from datagen.evaluation.columns import Gathered
+from datagen.evaluation.methods import EvaluatedMethod, open_models
+from datagen.evaluation.report import Part, evaluation_report
+from datagen.evaluation.runs import candidate_sets_of, open_evaluated_runs
+from datagen.evaluation.score_files import ScoreFile
 from datagen.train.models import build_model
 from datagen.train.training.checkpoints import Checkpoint, CheckpointHead, write_checkpoint
+from tests.datagen.evaluation.made_columns import make_columns
 from tests.made_runs import make_run
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG, arrays_of, json_of
@@ -107,25 +113,23 @@ def test_tables_equal_counts_of_the_run(
     _check_page(page.read_text(), n_sets=3)
 
 
-def test_a_candidate_set_is_reported_over_the_runs_that_cover_it(
-    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    near, file = tmp_path / "near", checkpoint(tmp_path / "c.pt")
-    drawn = ["--candidates", "in-range", "--candidates-per-scene", "4", "--n", "8", "--seed", "2"]
-    where = ["--out", str(near), "--config", str(grids.parent / "grid.toml"), "--workers", "0"]
-    assert cli.run(["submit", "plan", *drawn, *where]) == 0
-    (part,) = json_of(capsys, ["evaluate", file, str(near), str(grids), *QUICK])["parts"]
-    stored = arrays_of(grids)
-    clear = stored["base_is_clear"]
-    in_range = clear & (stored["mount_distance_m"] <= stored["arm_reach_m"])
-    told = {name: (said["runs"], said["count"], said["scenes"]) for name, said in part["sets"].items()}
-    scenes = {name: len(set(stored["sample_scene_index"][rows])) for name, rows in
-              (("in-range", in_range), ("clear", clear))}  # fmt: skip
-    assert told == {
-        "in-range": ([0, 1], int(in_range.sum()) + 8, scenes["in-range"] + 2),
-        "clear": ([1], int(clear.sum()), scenes["clear"]),
-        "grid": ([1], len(clear), SCENES),
-    }
+def test_a_candidate_set_is_reported_over_the_runs_that_cover_it(grids: Path) -> None:
+    (run,) = open_evaluated_runs([str(grids)])
+    (spec,) = run.specs
+    sampled = {"per_scene": 4, "within": "in-range"}
+    near = replace(
+        run, specs=(spec.model_copy(update={"candidates": spec.candidates.model_copy(update=sampled)}),)
+    )
+    assert candidate_sets_of([near, run]) == {"in-range": (0, 1), "clear": (1,), "grid": (1,)}
+    assert candidate_sets_of([near]) == {"in-range": (0,)} and (near.cells, run.cells) == (0, CELLS)
+    columns = make_columns(np.random.default_rng(0), 40)
+    columns = replace(columns, run=np.arange(40) % 2)
+    gathered = Gathered(columns, (), {"random": 1.0})
+    methods = [EvaluatedMethod("random", ScoreFile("random", "", 0.5, True, {}))]
+    sets = {"in-range": (0, 1), "clear": (1,)}
+    report = evaluation_report(gathered, methods, [], [Part("all", columns, sets)], [], {})
+    clear = report["parts"][0]["sets"]["clear"]
+    assert clear["count"] == (columns.is_clear & (columns.run[columns.scene] == 1)).sum()
 
 
 def _check_page(text: str, n_sets: int) -> None:
