@@ -39,8 +39,7 @@ from datagen.train.models import Model, build_model
 from datagen.train.models.hand_poses import HAND_WIDTH, N_MEASURES
 from datagen.train.models.shared import SharedModel
 from datagen.train.tensors import to_torch
-from datagen.train.training.loop import Position, Training, run_training
-from datagen.train.training.optimiser import make_optimiser
+from datagen.train.training.loop import Position, Training, make_optimiser, run_training
 from datagen.train.training.options import STAGES, Options
 from datagen.workers.labels.arm_labelling import arm_in_scene
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene

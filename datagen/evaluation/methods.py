@@ -24,7 +24,7 @@ from datagen.schemas.identity import digest_of
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.specification import HeuristicParams
 from datagen.train.baselines import BASELINES, fit_baselines, make_baselines
-from datagen.train.baselines.calibration import Calibration, calibrate
+from datagen.train.baselines.baseline import Calibration, calibrate
 from datagen.train.baselines.scalars import Scalars
 from datagen.train.scorers import ModelScorer, Scorer, weights_sha256
 from datagen.train.splits import refuse_shared_houses

@@ -24,9 +24,8 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
 from datagen.train.dataset import SampleStream
 from datagen.train.inputs import I64, Array, Batch, Bools, RobotInputs
-from datagen.train.models.encoded_clouds import EncodedCandidates, EncodedClouds, pack, packed_width
 from datagen.train.models.shared import SharedModel
-from datagen.train.models.tokens import token_sizes
+from datagen.train.models.tokens import EncodedCandidates, EncodedClouds, pack, packed_width, token_sizes
 from datagen.train.tensors import to_torch
 
 # Raise it when the same run would give other tokens or columns.

@@ -186,3 +186,14 @@ def open_sealed(path: Path | str, names: Sequence[str]) -> RunPart:
     ]
     slices = [ShardPlace(storage, "", i, *count, per_shard, full) for i, count in enumerate(counts)]
     return RunPart(str(path), spec_hashes, specs, schema, version, slices, arrays, None)
+
+
+def refuse_mixed_labels(parts: Sequence[tuple[str, Specification]]) -> None:
+    """Raise InputError where runs, (path, specification), have labels of one source in two versions."""
+    seen: dict[str, tuple[str, str]] = {}
+    for place, spec in parts:
+        version = spec.engines.get("labels", "unknown")
+        first, at = seen.setdefault(spec.label_source, (version, place))
+        if first != version:
+            problem = f"{spec.label_source} labels are of version {version}, those of {at} of version {first}"
+            raise InputError(place, "label_version", problem, "Use runs of one version")

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from datagen.schemas.errors import InputError
+from datagen.schemas.specification import Source, Specification
 from datagen.train.augment import Augmentation, Rotation
 from datagen.train.dataset import SampleStream
+from datagen.train.run_parts import refuse_mixed_labels
 from datagen.train.splits import HouseShare, HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
 from datagen.workers.houses import split_of
 from tests.train.stream_runs import make_stream_run
@@ -83,3 +85,15 @@ def test_one_class_is_refused_with_the_run_and_the_class(tmp_path: Path, label: 
         refuse_one_class(alike)
     make_stream_run(tmp_path / "good", 18, seed=1)
     refuse_one_class(SampleStream([tmp_path / "bad", tmp_path / "good"]))
+
+
+def specification(source: str, version: str) -> Specification:
+    assets = Source(kind="builtin", digest="1" * 64)
+    return Specification(label_source=source, houses=assets, objects=assets, engines={"labels": version})
+
+
+def test_versions_of_one_source_are_not_mixed() -> None:
+    old, new = specification("sim", "1"), specification("sim", "2")
+    refuse_mixed_labels([("a", new), ("b", new), ("c", specification("plan", "1"))])
+    with pytest.raises(InputError, match="sim labels are of version 2, those of a of version 1"):
+        refuse_mixed_labels([("a", old), ("b", new)])

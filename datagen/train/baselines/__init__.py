@@ -8,11 +8,9 @@ from pathlib import Path
 from datagen.schemas.errors import InputError, choices
 from datagen.schemas.specification import HeuristicParams
 from datagen.train.baselines.baseline import FIELDS, Baseline
-from datagen.train.baselines.detection import ThresholdDetector
-from datagen.train.baselines.detector import ZeroShotDetector
-from datagen.train.baselines.distance import DistanceBand
+from datagen.train.baselines.detector import ThresholdDetector, ZeroShotDetector
 from datagen.train.baselines.reachability import Reachability
-from datagen.train.baselines.rules import Analytic, Proximity, Threshold
+from datagen.train.baselines.rules import Analytic, DistanceBand, Proximity, Threshold
 from datagen.train.baselines.scalars import Scalars
 from datagen.train.inputs import Array, Batch
 from datagen.workers.robots import ROBOTS

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol, Self
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import F64, Array, Batch, Bools, is_clear
 from datagen.train.observed_visibility import observed_visibility
-from datagen.train.scorers import Scorer
+from datagen.train.scorers import Scorer, scored
 
 # Further columns of a batch that baselines need.
 FIELDS = ("base_is_clear", "house_id", "object_name")
@@ -100,3 +102,32 @@ def best_cut(score: F64, label: Bools) -> float:
     allowed = np.concatenate([[True], s[1:] > s[:-1], [False]])
     k = int(np.argmax(np.where(allowed, balanced, -1)))
     return float(s[0]) if k == 0 else float((s[k - 1] + s[k]) / 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A probability that never falls with the score: linear between knots, constant beyond them."""
+
+    score: F64  # (K,), rising
+    chance: F64  # (K,), in [0, 1]
+
+    def __call__(self, score: F64) -> F64:
+        """Probabilities of scores, in their shape."""
+        return np.interp(score, self.score, self.chance)
+
+
+def calibrate(baseline: Baseline, batches: Sequence[Batch[Array]]) -> Calibration:
+    """Calibration of a fitted baseline on clear candidates; equal scores get their mean label.
+
+    InputError where all labels are equal.
+    """
+    clear = np.concatenate([is_clear(b) for b in batches])
+    score = np.concatenate([scored(baseline, b) for b in batches])[clear]
+    good = labels(batches, baseline.name)[clear].astype(np.float64)
+    knots, at = np.unique(score, return_inverse=True)
+    count = np.bincount(at)
+    found = isotonic_regression(np.bincount(at, good) / count, weights=count)
+    ends = found.blocks
+    # A knot in the middle of each block, so that a better score has a higher chance between blocks.
+    middle = np.add.reduceat(knots * count, ends[:-1]) / np.add.reduceat(count, ends[:-1])
+    return Calibration(middle, found.x[ends[:-1]])

@@ -15,10 +15,10 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.train.baselines.baseline import best_cut, labels, planar_distance_m
-from datagen.train.baselines.free_approaches import free_approaches
 from datagen.train.baselines.reachability_map import (
     AZIMUTHS,
     ReachabilityMap,
+    free_approaches,
     part_directions,
     reachability_map,
 )

@@ -25,8 +25,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from datagen.train.inputs import CandidateInputs, Clouds, RobotInputs
-from datagen.train.models.crop import Crop, crop_clouds
-from datagen.train.models.grouping import ball_query, farthest_points, gather_rows, take_rows
+from datagen.train.models.crop import Crop, ball_query, crop_clouds, farthest_points, gather_rows, take_rows
 from datagen.train.models.model import Model, ModelConfig, read_config
 
 CANDIDATE_POINTS = 50

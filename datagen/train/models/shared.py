@@ -26,8 +26,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from datagen.train.inputs import CandidateInputs, Clouds, RobotInputs
-from datagen.train.models.crop import crop_clouds
-from datagen.train.models.encoded_clouds import EncodedCandidates, EncodedClouds, unpack
+from datagen.train.models.crop import crop_clouds, take_rows
 from datagen.train.models.frames import (
     N_PAIR_FEATURES,
     N_SCALARS,
@@ -36,7 +35,6 @@ from datagen.train.models.frames import (
     pair_features,
     target_features,
 )
-from datagen.train.models.grouping import take_rows
 from datagen.train.models.hand_pooling import HandPooling
 from datagen.train.models.hand_poses import poses_of_clouds
 from datagen.train.models.model import Model, ModelConfig, read_config
@@ -45,10 +43,13 @@ from datagen.train.models.tokens import (
     TARGET_NUMBERS,
     TARGET_TENSORS,
     TARGET_VECTORS,
+    EncodedCandidates,
+    EncodedClouds,
     Tokens,
     target_frame_points,
     token_sizes,
     tokens_of,
+    unpack,
 )
 from datagen.train.observed_visibility import visible_shares
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from datagen.schemas.specification import CandidateParams
+from datagen.train.arrivals import Arrival, expected_success, stands, tolerance_m
 from datagen.train.inputs import F32, F64, I64, Bools
 from datagen.train.prediction.floor_ways import CELL_M, WAYS, counted, draw_map, ways_to
 from datagen.train.prediction.footprints import Footprint
@@ -170,3 +172,36 @@ def _floor_share(floor_m: F32, base_xy: F64, yaw: F64, base: Footprint) -> F64:
     rows = np.floor((base_xy[:, None] + below - low) / _CELL_M).astype(np.int64)  # (N, D, 2)
     rows = np.clip(rows, 0, size - 1)
     return seen[rows[..., 0], rows[..., 1]].mean(axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The chosen base pose, as a row of the cells; None where none may be chosen."""
+
+    best: int | None
+    nominal: int | None  # the row with the best score
+    expected: F64 | None  # (N,) success expected with the arrival error; None without one
+    miss_m: float | None  # distance by which the robot may miss the best while scores stay good
+
+
+def choose(
+    score: F64, cells: BaseCells, allowed: Sequence[str], threshold: float, arrival: Arrival | None
+) -> Choice:
+    """The best of the cells in an `allowed` state; with an arrival error by the mean score on arrival.
+
+    A robot that arrives where a base is in another state fails. Scores from `threshold` on are good; without
+    a threshold (nan) there is no `miss_m`.
+    """
+    can_stand = np.isin(cells.state, [STATES.index(name) for name in allowed])
+    rows = np.flatnonzero(can_stand)
+    if not len(rows):
+        return Choice(None, None, None, None)
+    nominal = int(rows[np.argmax(score[rows])])
+    side = round(float(np.sqrt(len(score))))
+    step_m = float(np.ptp(cells.offset_m[:, 0]) / (side - 1))
+    value = stands(score, can_stand).reshape(side, side)
+    expected = None if arrival is None else expected_success(value, step_m, arrival).ravel()
+    best = nominal if expected is None else int(rows[np.argmax(expected[rows])])
+    if np.isnan(threshold):
+        return Choice(best, nominal, expected, None)
+    return Choice(best, nominal, expected, tolerance_m(value, step_m, divmod(best, side), threshold))

@@ -19,12 +19,13 @@ from datagen.train.prediction.base_cells import (
     STATES,
     UNSEEN,
     BaseCells,
+    Choice,
     RobotSize,
+    choose,
     observe_cells,
     seen_share,
     yaws_to_target,
 )
-from datagen.train.prediction.choice import Choice, choose
 from datagen.train.prediction.frames import SensorFrame, image_frame
 from datagen.train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
 from datagen.train.prediction.ground import Ground, find_ground

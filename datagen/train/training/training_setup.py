@@ -17,11 +17,10 @@ from datagen.schemas.errors import InputError
 from datagen.train.augment import Augmentation
 from datagen.train.dataset import SampleStream
 from datagen.train.encoded_runs import EncodedBatches, encode_runs, encoded_stream
-from datagen.train.label_versions import refuse_mixed_labels
 from datagen.train.models import Model, build_model
 from datagen.train.models.shared import SharedModel
 from datagen.train.rates import rate_fields
-from datagen.train.run_parts import open_parts
+from datagen.train.run_parts import open_parts, refuse_mixed_labels
 from datagen.train.splits import HouseShare, refuse_one_class, refuse_shared_houses, split_by_house
 from datagen.train.training.checkpoints import (
     Checkpoint,
@@ -32,8 +31,14 @@ from datagen.train.training.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from datagen.train.training.loop import Position, Training, run_training
-from datagen.train.training.optimiser import make_optimiser, optimiser_tensors, put_optimiser_tensors
+from datagen.train.training.loop import (
+    Position,
+    Training,
+    make_optimiser,
+    optimiser_tensors,
+    put_optimiser_tensors,
+    run_training,
+)
 from datagen.train.training.options import STAGES, Options
 from datagen.train.training.training_progress import TrainingProgress
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,16 +13,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.specification import HeuristicParams
+from datagen.schemas.specification import PANDA_REACH_M, HeuristicParams
 from datagen.train.baselines import BASELINES, FIELDS, Baseline, fit_baselines, make_baselines
-from datagen.train.baselines.baseline import best_cut, is_feasible, observed_rho, planar_distance_m
-from datagen.train.baselines.detection import ThresholdDetector, spoken_name
-from datagen.train.baselines.distance import DistanceBand
-from datagen.train.baselines.observed_clearance import observed_clearance_m
-from datagen.train.baselines.rules import Analytic, Proximity
-from datagen.train.baselines.scalars import FEATURES, Scalars, features
+from datagen.train.baselines.baseline import (
+    Unfitted,
+    best_cut,
+    calibrate,
+    is_feasible,
+    observed_rho,
+    planar_distance_m,
+)
+from datagen.train.baselines.detector import ThresholdDetector, spoken_name
+from datagen.train.baselines.rules import Analytic, DistanceBand, Proximity
+from datagen.train.baselines.scalars import FAR_M, FEATURES, Scalars, features, observed_clearance_m
 from datagen.train.dataset import SampleStream
-from datagen.train.inputs import is_clear
+from datagen.train.inputs import F64, Batch, is_clear
 from datagen.workers.labels.distance_visibility_score import heuristic
 from tests.sim_extra import SIM_INSTALLED
 from tests.train.baselines.scenes import make_batch, moved, take
@@ -203,3 +209,91 @@ def test_fits_on_a_run_and_scores_it(sim_run: Path) -> None:
 )
 def test_object_names_become_words(name: str, spoken: str) -> None:
     assert spoken_name(name) == spoken
+
+
+@dataclass(frozen=True, eq=False)
+class Given(Unfitted):
+    """Scores that are given."""
+
+    scores: F64
+    name = "given"
+    threshold = 0.0
+
+    def score(self, batch: Batch[Any]) -> F64:
+        return self.scores
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 100), levels=st.integers(2, 30))
+def test_chances_rise_with_the_score_and_have_the_mean_of_the_labels(seed: int, levels: int) -> None:
+    batch, rng = make_batch(seed), np.random.default_rng(seed)
+    score = 100.0 * rng.integers(0, levels, len(batch))
+    label = (rng.uniform(size=len(batch)) < score / (100 * levels)).astype(np.int64)
+    clear = is_clear(batch)
+    if len(set(label[clear])) < 2:
+        return
+    chances = calibrate(Given(score), [replace(batch, label=label)])
+    at = chances(np.linspace(-1000, 100 * levels + 1000, 300))
+    assert (np.diff(at) >= -1e-12).all() and at.min() >= 0 and at.max() <= 1
+
+
+def test_two_scores_get_the_shares_of_good_ones_among_clear_candidates() -> None:
+    batch = make_batch(1)
+    clear = is_clear(batch)
+    score = np.where(np.arange(len(batch)) % 2 == 0, 7.0, -3.0)
+    k = np.arange(len(batch))
+    label = np.where(score == 7, k % 3 > 0, k % 5 == 0).astype(np.int64)
+    chances = calibrate(Given(score), [replace(batch, label=label)])
+    for value in (-3.0, 7.0):
+        share = label[clear & (score == value)].mean()
+        assert chances(np.array([value]))[0] == pytest.approx(share)
+
+
+def test_equal_labels_cannot_be_calibrated() -> None:
+    batch = make_batch(0)
+    with pytest.raises(InputError, match="labels are equal"):
+        calibrate(Given(np.zeros(len(batch))), [replace(batch, label=np.ones_like(batch.label))])
+
+
+def batch_with(points_m: list[list[float]], base_xy_m: list[list[float]]) -> Batch[Any]:
+    """A target 0.8 m above the floor, an arm of 1 m mounted at 0.7 m, and bases."""
+    batch = take(make_batch(0, n_scenes=1, per_robot=len(base_xy_m)), np.arange(len(base_xy_m)))
+    points = np.array([points_m], np.float32)
+    clouds = replace(
+        batch.clouds,
+        points_m=points,
+        rgb=np.zeros(points.shape, np.uint8),
+        target_mask=np.zeros(points.shape[:2], np.bool_),
+        n_points=np.array([points.shape[1]]),
+        target_height_m=np.array([0.8], np.float32),
+    )
+    mounts, reach = np.full(2, 0.7, np.float32), np.ones(2, np.float32)
+    robots = replace(batch.robots, base_height_m=mounts, arm_reach_m=reach)
+    return moved(replace(batch, clouds=clouds, robots=robots), np.array(base_xy_m))
+
+
+def test_it_is_the_distance_to_the_nearest_point_beside_the_base() -> None:
+    batch = batch_with([[0, 0, -0.4], [0, 0.3, -0.4]], [[0.6, 0], [0.1, 0], [2.0, 0]])
+    np.testing.assert_allclose(observed_clearance_m(batch), [0.35, -0.15, FAR_M], atol=1e-6)
+
+
+@pytest.mark.parametrize("height_m", [-0.79, 0.0, np.nan])  # floor, above the mount, not a number
+def test_other_points_leave_all_free(height_m: float) -> None:
+    assert (observed_clearance_m(batch_with([[0, 0, height_m]], [[0.1, 0], [0.5, 0]])) == FAR_M).all()
+
+
+def test_narrow_bases_of_short_arms_have_more_room() -> None:
+    batch = batch_with([[0, 0, -0.4]], [[0.5, 0]])
+    short = replace(batch, robots=replace(batch.robots, arm_reach_m=np.full(2, 0.5, np.float32)))
+    np.testing.assert_allclose(
+        observed_clearance_m(short) - observed_clearance_m(batch), 0.25 * (1 - 0.5 / PANDA_REACH_M), atol=1e-6
+    )
+
+
+def test_more_points_leave_less_room_and_order_does_not_matter() -> None:
+    batch = make_batch(3)
+    room = observed_clearance_m(batch)
+    fewer = replace(batch, clouds=replace(batch.clouds, n_points=batch.clouds.n_points // 2))
+    assert (observed_clearance_m(fewer) >= room).all() and (observed_clearance_m(fewer) > room).any()
+    rows = np.random.default_rng(0).permutation(len(batch))
+    assert np.array_equal(observed_clearance_m(take(batch, rows)), room[rows])

@@ -11,8 +11,7 @@ import pytest
 from datagen.schemas.errors import InputError
 from datagen.train.baselines import make_baselines
 from datagen.train.baselines.baseline import is_feasible
-from datagen.train.baselines.detection import render_views
-from datagen.train.baselines.detector import Detections, ZeroShotDetector
+from datagen.train.baselines.detector import Detections, ZeroShotDetector, render_views
 from tests.train.baselines.scenes import make_batch
 
 

@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 
 from datagen.schemas.errors import InputError
-from datagen.train.baselines.free_approaches import free_approaches
 from datagen.train.baselines.reachability import Reachability
-from datagen.train.baselines.reachability_map import AZIMUTHS, part_directions, reachability_map
+from datagen.train.baselines.reachability_map import (
+    AZIMUTHS,
+    free_approaches,
+    part_directions,
+    reachability_map,
+)
 from datagen.train.inputs import Batch, is_clear
 from tests.sim_extra import needs_sim
 from tests.train.baselines.scenes import make_batch, moved

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from datagen.train.inputs import F32, F64
 from datagen.train.models.frames import frames_of
 from datagen.train.models.hand_pooling import from_mount
-from datagen.train.models.hand_poses import HAND_WIDTH, N_MEASURES, hand_poses
+from datagen.train.models.hand_poses import FARTHEST, HAND_WIDTH, N_MEASURES, DistanceGrid, hand_poses
 
 HALF_M = np.array([0.02, 0.08, 0.05])  # a box: only across its narrow side does it fit between the fingers
 COUNT = 104
@@ -109,3 +109,23 @@ def test_features_from_the_mount_are_those_of_the_mirrored_scene():
     here = from_mount(axes, frames_of(base, *rest))
     there = from_mount(axes * flip, frames_of(base * flip[:2], *rest))
     torch.testing.assert_close(here, there, atol=1e-5, rtol=1e-4)
+
+
+LOW_M, SHAPE, CELL_M = np.array([-0.3, -0.1, 0.0]), (30, 14, 9), 0.02
+CENTRES_M = LOW_M + CELL_M * (np.argwhere(np.ones(SHAPE)) + 0.5)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 1000), st.integers(1, 40))
+def test_distances_are_those_of_every_pair_of_cells(seed: int, count: int):
+    held = CENTRES_M[np.random.default_rng(seed).integers(0, len(CENTRES_M), count)]
+    grid = DistanceGrid(held, LOW_M, SHAPE, CELL_M)
+    each = np.linalg.norm(CENTRES_M[:, None] - held, axis=2).min(1)
+    np.testing.assert_allclose(grid(CENTRES_M, -1), np.minimum(each, FARTHEST * CELL_M), atol=1e-6)
+
+
+def test_points_outside_and_points_that_are_no_numbers_are_left_out():
+    bad = np.array([[np.nan, 0, 0], [np.inf, 0, 0.01], [5.0, 0.0, 0.0], [0.0, 0.0, -0.01]])
+    grid = DistanceGrid(bad, LOW_M, SHAPE, CELL_M)
+    assert np.ptp(grid(CENTRES_M, -1)) == 0
+    np.testing.assert_array_equal(grid(CENTRES_M[:1] + 1.0, 0.1), np.array([0.1], np.float32))

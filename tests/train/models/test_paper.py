@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from datagen.train.models.crop import crop_clouds
-from datagen.train.models.grouping import ball_query, take_rows
+from datagen.train.models.crop import ball_query, crop_clouds, take_rows
 from datagen.train.models.paper import CANDIDATE_POINTS, PaperModel
 from tests.train.models.made_batches import drawn_tables, small_model
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
 from datagen.train.models import Model, build_model
-from datagen.train.training.optimiser import (
+from datagen.train.training.loop import (
     make_optimiser,
     optimiser_tensors,
     put_optimiser_tensors,
