@@ -97,8 +97,9 @@ def build_app(called: str = "") -> App:
             negative=(), show_default=lambda value: None if value is False else value
         ),
     )
-    for verb, (target, line) in VERBS.items():
-        app.command(target, name=verb, help=None if verb == called else line, group=groups.get(verb))
+    for number, (verb, (target, line)) in enumerate(VERBS.items()):
+        text = None if verb == called else line
+        app.command(target, name=verb, help=text, group=groups.get(verb), sort_key=number)
     return app
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, fields
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hi
 from cyclopts import Parameter
 from pydantic import TypeAdapter, ValidationError
 
-from datagen.configuration.toml_files import parse_toml, read_toml
+from datagen.configuration.toml_files import read_toml
 from datagen.console.command_lines import Interrupted, interruptible, options_of, print_interrupted, prints
 from datagen.console.options import AllowIncomplete, AsJson, File, PathOrAddress, PathsOrAddresses, Whole
 from datagen.console.printing import print_json, print_rows, seconds
@@ -211,8 +212,8 @@ def model_sizes(words: Sequence[str]) -> dict[str, Any]:
             sizes |= read_toml(Path(word), _FIX)
             continue
         try:
-            sizes[name.strip()] = parse_toml(f"value = {text}")["value"]
-        except ValueError:
+            sizes[name.strip()] = tomllib.loads(f"value = {text}")["value"]
+        except (ValueError, RecursionError):
             sizes[name.strip()] = text
     return sizes
 

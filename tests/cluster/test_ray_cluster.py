@@ -119,6 +119,7 @@ except grpc.RpcError as error: print(error.code().name)
 
 @needs_root
 def test_another_user_can_neither_enter_nor_read_nor_speak_to_a_local_cluster() -> None:
+    shared = set(Path("/tmp/ray").glob(f"session_*_{os.getpid()}"))  # of other tests' clusters
     with ray_cluster(RaySettings(workers=1)) as ray:
         token = str(ray.get(ray.remote(lambda: os.environ["RAY_AUTH_TOKEN"]).remote()))
         folder = Path(ray._private.worker._global_node.temp_dir).parent
@@ -129,7 +130,7 @@ def test_another_user_can_neither_enter_nor_read_nor_speak_to_a_local_cluster() 
         assert tried == ["refused"] * (3 + len(its)) + ["UNAUTHENTICATED"]
         assert traces_of(token, [folder]) == []
     assert not folder.exists() and not [p for p in its if is_alive(p)]
-    assert not list(Path("/tmp/ray").glob(f"session_*_{os.getpid()}"))
+    assert set(Path("/tmp/ray").glob(f"session_*_{os.getpid()}")) == shared
 
 
 def test_the_next_cluster_removes_what_a_killed_driver_left() -> None:
