@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from datagen.schemas.run import Run
-from datagen.schemas.scene_rows import read_scene
+from datagen.schemas.shard_reading import read_scene
 from datagen.schemas.specification import CandidateParams
 from datagen.workers.bases.clearance import STEP_M, base_clearance_m
 from datagen.workers.geometry.mesh import F64

@@ -28,9 +28,9 @@ import numpy as np
 import torch
 
 from datagen.display.progress import counting
-from datagen.schemas.cost import StageClock
 from datagen.schemas.run import Run
-from datagen.schemas.scene_rows import read_scenes
+from datagen.schemas.run_records import StageClock
+from datagen.schemas.shard_reading import read_scenes
 from datagen.train.bootstrap import resample_weights, resampled_area_under_roc
 from datagen.train.encoded_runs import EncodedBatches, EncodedRuns, encode_runs, encoded_stream
 from datagen.train.inputs import F32, F64, Array, Bools

@@ -20,9 +20,9 @@ from PIL import Image, ImageDraw
 from benchmarks.repeatability import stored_scenes
 from datagen.drawing.film import Film, filmstrip_moments
 from datagen.drawing.posed_robot import robot_bodies
-from datagen.schemas.cost import StageClock
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
+from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import Specification
 from datagen.workers.labels.arm_labelling import ArmInScene, CandidateTrial, arm_in_scene, try_candidate
 from datagen.workers.scenes import SettledScene

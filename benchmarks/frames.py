@@ -16,8 +16,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
+from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import NoiseParams, Source, Specification
 from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
 from datagen.train.prediction.ground import find_ground, floor_points

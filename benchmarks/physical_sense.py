@@ -19,8 +19,8 @@ import numpy as np
 
 from benchmarks.options import scene_options
 from datagen.configuration.specify import specify
-from datagen.schemas.cost import StageClock
 from datagen.schemas.identity import Stream, generator
+from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import DisturbanceParams, Specification, TrialParams
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64

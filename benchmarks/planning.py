@@ -24,8 +24,8 @@ import numpy as np
 from benchmarks.options import scene_options
 from benchmarks.robots import robots_folder
 from datagen.configuration.specify import specify
-from datagen.schemas.cost import StageClock
 from datagen.schemas.identity import Stream, generator
+from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import ArmParams
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64

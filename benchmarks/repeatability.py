@@ -26,10 +26,10 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.configuration.specify import put_field
-from datagen.schemas.cost import StageClock
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.run import Run
-from datagen.schemas.scene_rows import read_scenes
+from datagen.schemas.run_records import StageClock
+from datagen.schemas.shard_reading import read_scenes
 from datagen.schemas.specification import Specification
 from datagen.train.bootstrap import resample_weights
 from datagen.workers.bases.candidates import SceneCandidates, distances

@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.options import scene_options
 from datagen.configuration.specify import specify
-from datagen.schemas.cost import StageClock
+from datagen.schemas.run_records import StageClock
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects

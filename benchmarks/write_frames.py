@@ -17,9 +17,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from datagen.schemas.cost import StageClock
 from datagen.schemas.run import Run
-from datagen.schemas.scene_rows import read_scenes
+from datagen.schemas.run_records import StageClock
+from datagen.schemas.shard_reading import read_scenes
 from datagen.schemas.specification import Source, Specification
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects

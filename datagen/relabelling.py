@@ -20,16 +20,22 @@ from datagen.cluster.shard_policy import RetryPolicy
 from datagen.configuration.specify import manifest_of
 from datagen.configuration.stored_scenes import StoredScenes, specify_again
 from datagen.display.progress import Progress
-from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import sample_ids
-from datagen.schemas.keys import MERGED, part_folder, shard_folder
-from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record, publish, refuse_foreign, utc_now
+from datagen.schemas.record_files import (
+    MAX_RECORD_BYTES,
+    MERGED,
+    encode_record,
+    part_folder,
+    publish,
+    refuse_foreign,
+    shard_folder,
+    utc_now,
+)
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Commit, FileEntry, Merged
+from datagen.schemas.run_records import Commit, FileEntry, Merged, ShardRanges, StageClock
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_files import encode_array, group_metadata
-from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.shard_reading import read_committed
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import Storage

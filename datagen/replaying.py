@@ -15,9 +15,9 @@ from datagen.console.options import AS_FOUND, Sources
 from datagen.schemas.checking.finding import Finding
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import Field
-from datagen.schemas.keys import shard_folder
+from datagen.schemas.record_files import shard_folder
 from datagen.schemas.run import Run
-from datagen.schemas.scene_rows import read_scenes
+from datagen.schemas.shard_reading import read_scenes
 from datagen.workers.run_shard import run_shard
 from datagen.workers.world import World, open_world
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import sys
 
-from datagen.schemas.description import CONVENTIONS
 from datagen.schemas.fields import SCHEMA_VERSION, SCHEMAS, Field, RecordSchema
 from datagen.schemas.outcomes import OUTCOMES, REDRAW_CAUSES
 from datagen.schemas.run_records import FORMAT_VERSION
-from datagen.schemas.shard_files import MAX_CHUNK_BYTES, ZSTD_LEVEL
+from datagen.schemas.shard_files import CONVENTIONS, MAX_CHUNK_BYTES, ZSTD_LEVEL
 
 _HEAD = f"""# Data format
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from datagen.evaluation.benchmark import DEFINITION, Benchmark, BenchmarkRun, digests_of, read_benchmark
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
-from datagen.schemas.whole_files import whole_file
+from datagen.schemas.safe_files import whole_file
 
 
 def frozen(run: BenchmarkRun, path: Path) -> BenchmarkRun:

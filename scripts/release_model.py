@@ -22,7 +22,7 @@ from datagen.commands.predict import predict
 from datagen.evaluation.report_tables import DECISIONS
 from datagen.released.card import card_text
 from datagen.schemas.errors import InputError
-from datagen.schemas.whole_files import whole_file
+from datagen.schemas.safe_files import whole_file
 from datagen.train.prediction import load_scorer
 from datagen.train.scorers import ModelScorer, weights_sha256
 from datagen.train.training.checkpoints import Checkpoint, load_model, read_checkpoint, write_checkpoint

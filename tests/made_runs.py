@@ -12,9 +12,8 @@ import numpy as np
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import Field, RecordSchema, sized_schema
 from datagen.schemas.identity import sample_ids
-from datagen.schemas.keys import shard_folder
 from datagen.schemas.outcomes import REDRAW_CAUSES
-from datagen.schemas.record_files import utc_now
+from datagen.schemas.record_files import shard_folder, utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, Cost, FileEntry, Host, Layout, LedgerEntry, Manifest
 from datagen.schemas.shard_files import encode_shard

@@ -21,8 +21,7 @@ from datagen.assets.download import DownloadPolicy, Progress, download
 from datagen.assets.unpack import Limits, unpack
 from datagen.schemas.errors import InputError
 from datagen.schemas.run_records import Digest, StoredRecord
-from datagen.schemas.untrusted_files import open_regular, read_regular
-from datagen.schemas.whole_files import whole_file
+from datagen.schemas.safe_files import open_regular, read_regular, whole_file
 
 LOCK_NAME = "assets.lock.json"
 _MAX_LOCK_BYTES = 2**20

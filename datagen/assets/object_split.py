@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import read_regular
-from datagen.schemas.whole_files import whole_file
+from datagen.schemas.safe_files import read_regular, whole_file
 
 Part = Literal["train", "test"]
 EVERY = 5

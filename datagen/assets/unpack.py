@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, cast
 
-from datagen.schemas.archives import DAMAGED_ZIP, open_member
 from datagen.schemas.errors import InputError
+from datagen.schemas.safe_files import DAMAGED_ZIP, open_member
 
 _CHUNK_BYTES = 2**20
 # zipfile reads its list of members at once; tarfile reads a header's extension, which may have its own.

@@ -9,12 +9,11 @@ from functools import lru_cache
 from datagen.cluster.attempt_guard import Meter, this_host
 from datagen.cluster.protocol import AttemptResult, JobCannotContinue, ShardTask
 from datagen.schemas.errors import InputError
-from datagen.schemas.keys import commit_key
-from datagen.schemas.record_files import utc_now
+from datagen.schemas.record_files import commit_key, utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
-from datagen.schemas.scene_rows import read_scenes
 from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.shard_reading import read_scenes
 from datagen.schemas.storage.errors import FORBIDDEN, FULL, machine_error
 from datagen.workers.robots import gripper_of
 from datagen.workers.run_shard import run_shard

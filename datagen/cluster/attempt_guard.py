@@ -32,12 +32,10 @@ from typing import TypeVar
 import psutil
 
 from datagen.cluster.protocol import AttemptReport, AttemptResult, JobCannotContinue, Task
-from datagen.schemas.cost import StageClock
-from datagen.schemas.locked_folders import is_private
 from datagen.schemas.record_files import utc_now
-from datagen.schemas.run_records import Cost, Host, Outcome
+from datagen.schemas.run_records import Cost, Host, Outcome, StageClock
+from datagen.schemas.safe_files import is_private, whole_file
 from datagen.schemas.storage.errors import FULL, StoreUnavailable, machine_error
-from datagen.schemas.whole_files import whole_file
 
 T = TypeVar("T", bound=Task)
 

@@ -15,8 +15,7 @@ from pathlib import Path
 
 import psutil
 
-from datagen.schemas.locked_folders import locked_folder
-from datagen.schemas.whole_files import whole_file
+from datagen.schemas.safe_files import locked_folder, whole_file
 
 _PARENT = Path("/tmp")  # sockets need a short path
 _KIND = "datagen-ray-"

@@ -23,8 +23,8 @@ from datagen.cluster.environment import is_of_the_shell
 from datagen.cluster.ray_jobs import dashboard_status
 from datagen.cluster.ray_settings import head_arguments, head_environment, new_token
 from datagen.schemas.errors import InputError
-from datagen.schemas.locked_folders import is_private
 from datagen.schemas.run_records import StoredRecord
+from datagen.schemas.safe_files import is_private
 
 _START_WITHIN_S = 300.0
 _KIND = "datagen-head-"

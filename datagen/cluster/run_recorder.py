@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from datagen.cluster.shard_policy import ShardFailures
-from datagen.schemas.keys import commit_key
-from datagen.schemas.ledger import end_from_commit, lost_end
-from datagen.schemas.record_files import utc_now
+from datagen.schemas.record_files import commit_key, end_from_commit, lost_end, utc_now
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Commit, LedgerEntry, QuarantineRecord
-from datagen.schemas.shard_ranges import ShardRanges
+from datagen.schemas.run_records import Commit, LedgerEntry, QuarantineRecord, ShardRanges
 
 
 class RunRecorder:

@@ -14,7 +14,7 @@ from datagen.reports.audit import audit_runs
 from datagen.reports.audit_tables import print_costs, print_source
 from datagen.reports.prices import read_prices
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.run import open_runs
 
 
 def audit(

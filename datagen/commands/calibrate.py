@@ -16,7 +16,7 @@ from datagen.display.progress import steps
 from datagen.evaluation.report_tables import with_interval
 from datagen.reports.specification_summary import specification_record
 from datagen.schemas.errors import InputError, one_line, printable
-from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.run import open_runs
 from datagen.schemas.specification import HeuristicParams, Specification
 from datagen.train.bootstrap import Estimate
 from datagen.train.heuristic_fit import (

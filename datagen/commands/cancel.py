@@ -17,7 +17,7 @@ from datagen.jobs.detach import jobs_api_of
 from datagen.jobs.job_report import health_line, job_report
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import Jobs, StoredJob
-from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.run import open_runs
 from datagen.schemas.storage import open_storage
 
 _POLL_S = 1.0

@@ -15,10 +15,9 @@ from datagen.display.progress import steps
 from datagen.jobs.start_job import absolute_path
 from datagen.reports.spending import account_for
 from datagen.schemas.lineage import lineage_summary
-from datagen.schemas.merged_runs import label_counts, open_runs
 from datagen.schemas.merging import MergePlan, MergeResult, merge_runs, plan_merge
 from datagen.schemas.merging.writing import WrittenUnion
-from datagen.schemas.run import Run
+from datagen.schemas.run import Run, label_counts, open_runs
 
 _WORDS = {
     "there_before": "merged before",

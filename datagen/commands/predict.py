@@ -18,7 +18,7 @@ from datagen.console.options import AsJson, File, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.released import DEMO_BASE_HEIGHT_M, DEMO_CLICK, DEMO_REACH_M, sample_frame
 from datagen.schemas.errors import InputError
-from datagen.schemas.whole_files import whole_file
+from datagen.schemas.safe_files import whole_file
 from datagen.workers.geometry.mesh import F64
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from datagen.console.options import AsJson, RunPath
 from datagen.console.printing import counted, print_json, print_rows, seconds
 from datagen.relabelling import Relabelled, relabel_all, relabelled_specification
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.run import open_runs
 from datagen.schemas.storage import Storage, open_storage
 
 

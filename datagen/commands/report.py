@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from datagen.console.options import refuse_output
 from datagen.console.printing import print_rows, size
 from datagen.schemas.errors import InputError
-from datagen.schemas.whole_files import whole_file
+from datagen.schemas.safe_files import whole_file
 
 
 def report(paths: Annotated[list[str], Parameter(name="PATH...")], /, *, out: Path) -> int:

@@ -25,9 +25,8 @@ from datagen.jobs.job import Job, JobOptions, JobRun, refuse_odd_n
 from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.start_job import absolute_path, open_job_run, with_absolute_paths, words_to_resume
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lift_quarantine
-from datagen.schemas.run import Run
+from datagen.schemas.run import Run, open_runs
 from datagen.schemas.storage import open_storage
 
 

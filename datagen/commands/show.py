@@ -10,8 +10,8 @@ from datagen.console.options import AS_FOUND, AssetSources, RunPath, Whole, refu
 from datagen.console.printing import print_rows
 from datagen.drawing.scene_picture import Shown, draw_scene_picture
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged_runs import find_scene, open_runs
-from datagen.schemas.scene_rows import read_scene
+from datagen.schemas.run import find_scene, open_runs
+from datagen.schemas.shard_reading import read_scene
 from datagen.workers.scenes.reconstruct import reconstruct_scene
 from datagen.workers.world import open_world
 

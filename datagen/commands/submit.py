@@ -27,13 +27,10 @@ from datagen.jobs.start_job import (
     with_absolute_paths,
     words_to_resume,
 )
-from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
-from datagen.schemas.keys import MERGED
-from datagen.schemas.record_files import refuse_other
+from datagen.schemas.record_files import MERGED, refuse_other
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Manifest
-from datagen.schemas.shard_ranges import ShardRanges
+from datagen.schemas.run_records import Manifest, ShardRanges, StageClock
 from datagen.schemas.storage import open_storage
 from datagen.workers.houses import open_houses
 from datagen.workers.labels import load_label_source

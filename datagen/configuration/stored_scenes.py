@@ -22,7 +22,7 @@ from datagen.configuration.specify import (
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
-from datagen.schemas.scene_rows import committed_scenes
+from datagen.schemas.shard_reading import committed_scenes
 from datagen.schemas.specification import Specification
 
 # Sections that a configuration may set for stored scenes.

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import read_regular
+from datagen.schemas.safe_files import read_regular
 
 _MAX_BYTES = 1 << 20
 

@@ -11,9 +11,9 @@ from datagen.display.styles import OUTCOME_STYLES
 from datagen.drawing.film import Film, filmstrip_moments, write_animation, write_sheet
 from datagen.drawing.posed_robot import robot_bodies
 from datagen.drawing.scene_picture import Lines, Shown, best_success
-from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64

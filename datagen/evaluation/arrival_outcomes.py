@@ -22,15 +22,14 @@ import numpy as np
 from datagen.cluster.environment import changed_environment
 from datagen.configuration.specify import label_engines
 from datagen.display.progress import counting
-from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import Stream, digest_of, generator
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
-from datagen.schemas.scene_rows import read_scene
+from datagen.schemas.run_records import StageClock
+from datagen.schemas.safe_files import read_regular, whole_file
+from datagen.schemas.shard_reading import read_scene
 from datagen.schemas.specification import Specification
-from datagen.schemas.untrusted_files import read_regular
-from datagen.schemas.whole_files import whole_file
 from datagen.workers.labels.arm_labelling import arm_in_scene, draw_disturbances
 from datagen.workers.labels.arrival_trial import arrival_specification, try_arrival
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene

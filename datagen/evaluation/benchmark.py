@@ -20,9 +20,9 @@ from datagen.schemas.errors import InputError, choices
 from datagen.schemas.identity import digest_of
 from datagen.schemas.record_files import different_fields
 from datagen.schemas.run_records import Digest, StoredRecord
+from datagen.schemas.safe_files import read_regular
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
-from datagen.schemas.untrusted_files import read_regular
 from datagen.train.reader import SampleReader
 from datagen.train.run_parts import open_parts
 

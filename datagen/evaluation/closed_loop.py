@@ -30,8 +30,7 @@ from datagen.evaluation.report import RESAMPLES
 from datagen.evaluation.runs import EvaluatedRun
 from datagen.evaluation.scores import weights_for
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged_runs import find_scene, open_runs
-from datagen.schemas.run import Run
+from datagen.schemas.run import Run, find_scene, open_runs
 from datagen.train.arrivals import Arrival, ring_arrival
 from datagen.train.bootstrap import Estimate, Weights, summed
 from datagen.train.inputs import F64, I64, Bools

@@ -21,7 +21,7 @@ from datagen.evaluation.score_files import ScoreFile, read_scores
 from datagen.released import RELEASED, released_checkpoint
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
-from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.run import open_runs
 from datagen.schemas.specification import HeuristicParams
 from datagen.train.baselines import BASELINES, fit_baselines, make_baselines
 from datagen.train.baselines.baseline import Calibration, calibrate

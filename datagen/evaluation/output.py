@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from datagen.console.options import refuse_output
 from datagen.console.printing import print_json, print_rows
-from datagen.schemas.whole_files import whole_file
+from datagen.schemas.safe_files import whole_file
 
 if TYPE_CHECKING:
     from datagen.evaluation.columns import Gathered

@@ -11,7 +11,7 @@ from datagen.evaluation.columns import EXTRA
 from datagen.released import checkpoint_file
 from datagen.reports.specification_summary import specification_record
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.run import open_runs
 from datagen.schemas.specification import Specification
 from datagen.train.baselines import FIELDS
 from datagen.train.dataset import SampleStream

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import read_regular
+from datagen.schemas.safe_files import read_regular
 from datagen.train.inputs import F64, Array, Batch, is_clear
 
 HEAD = ("sample_id", "score")

@@ -11,7 +11,7 @@ from datagen.display.html_page import escape, html_page
 from datagen.html_report.run_section import run_section
 from datagen.released import checkpoint_file
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.run import open_runs
 
 Section = tuple[str, Callable[[str], Iterator[str]]]
 

@@ -17,10 +17,10 @@ from datagen.html_report.run_columns import RunColumns, read_columns
 from datagen.reports.label_costs import audit_report
 from datagen.reports.run_status import status_report
 from datagen.reports.spending import account_for
-from datagen.schemas.description import described
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
-from datagen.schemas.scene_rows import read_scenes
+from datagen.schemas.shard_files import described
+from datagen.schemas.shard_reading import read_scenes
 from datagen.workers.extras import missing_library
 
 _SCENES = 3

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 from datagen.console.printing import counted
 from datagen.schemas.jobs import Jobs
-from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lifted_records
-from datagen.schemas.run import Run
+from datagen.schemas.run import Run, open_runs
 from datagen.schemas.storage import Storage
 
 _GOOD = ("committed", "superseded")

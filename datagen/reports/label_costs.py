@@ -14,8 +14,8 @@ from typing import Any
 from datagen.reports.agreement import Labelled
 from datagen.reports.prices import Prices, read_prices
 from datagen.reports.spending import QUARANTINED, Account, Spending
-from datagen.schemas.cost import STAGES
 from datagen.schemas.run import Run
+from datagen.schemas.run_records import STAGES
 
 # GBPP: 180,000 distance-visibility labels in under three days on one RTX A5000, and over three weeks
 # for as many simulated ones.

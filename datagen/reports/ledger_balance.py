@@ -8,9 +8,7 @@ from math import fsum
 
 from datagen.schemas.checking.attempts import ODD_COST_FIX, odd_cost
 from datagen.schemas.checking.finding import Finding, below
-from datagen.schemas.keys import commit_key
-from datagen.schemas.ledger import end_key
-from datagen.schemas.record_files import REPAIR
+from datagen.schemas.record_files import REPAIR, commit_key, end_key
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, Cost, LedgerEntry, other_value
 

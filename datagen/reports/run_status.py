@@ -6,11 +6,10 @@ from collections import Counter
 from typing import Any
 
 from datagen.schemas.lineage import lineage_summary
-from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lifted_records
-from datagen.schemas.run import Run
+from datagen.schemas.run import Run, open_runs
+from datagen.schemas.run_records import ShardRanges
 from datagen.schemas.sealing import SealedPart, SealedRoot, sealed_root
-from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage
 
 _SHOWN = 20  # causes and stacks

@@ -7,31 +7,31 @@ of two racing attempts one wins and the other is waste.
 from __future__ import annotations
 
 import re
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMA_VERSION, RecordSchema, sized_schema
-from datagen.schemas.keys import (
-    MERGED,
-    commit_copy_key,
-    commit_key,
-    part_folder,
-    shard_folder,
-)
-from datagen.schemas.ledger import MAX_STACK_CHARS, Ledger
 from datagen.schemas.record_files import (
     MAX_RECORD_BYTES,
+    MAX_STACK_CHARS,
+    MERGED,
     REPAIR,
+    Ledger,
+    commit_copy_key,
+    commit_key,
     decode_record,
     encode_record,
+    part_folder,
     publish,
     read_record,
     read_records,
     refuse_foreign,
     refuse_other,
     refuse_other_format,
+    shard_folder,
     utc_now,
 )
 from datagen.schemas.run_records import (
@@ -42,10 +42,10 @@ from datagen.schemas.run_records import (
     Merged,
     Plan,
     QuarantineRecord,
+    ShardRanges,
     foreign_field,
     other_value,
 )
-from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage, open_storage
 from datagen.schemas.storage.errors import StoreUnavailable
 
@@ -264,3 +264,58 @@ class Run:
         numbered = ((name, int(found[1])) for name in names if (found := _NUMBERED.fullmatch(name)))
         # Only names in the form that is written: no drafts, and not "7.json" for "000007.json".
         return {number for name, number in numbered if name == f"{number:0{width}d}.json"}
+
+
+def open_runs(path: Storage | Path | str) -> list[Run]:
+    """Return the run at `path`, or the parts of merged runs in the order of their rows in the store.
+
+    InputError where there is no run, or one that is damaged or of another format.
+    """
+    storage = path if isinstance(path, Storage) else open_storage(path, probe=False, create=False)
+    merged = read_record(storage, MERGED, Merged)
+    if merged is None:
+        return [Run.open(storage)]
+    refuse_other_format(f"{storage.url}/{MERGED}", merged.format_version)
+    runs = [Run.open(storage.below(part_folder(spec_hash))) for spec_hash in merged.parts]
+    for run, spec_hash in zip(runs, merged.parts, strict=True):
+        if found := other_value(run.manifest, spec_hash=spec_hash):
+            raise InputError(f"{run.storage.url}/manifest.json", *found, REPAIR)
+    return runs
+
+
+@dataclass(frozen=True)
+class LabelCounts:
+    """Planned and committed labels of runs, and the number of missing shards."""
+
+    n: int
+    labels: int
+    missing: int
+
+
+def label_counts(runs: Iterable[Run]) -> LabelCounts:
+    """Sums over runs. Shards beyond a run's n do not count, and the last one is cut."""
+    n = labels = missing = 0
+    for run in runs:
+        run_n = run.n
+        shards = run.layout.shards_for(run_n)
+        done = [shard for shard in run.committed() if shard < shards]
+        n += run_n
+        labels += sum(run.layout.rows_wanted(shard, run_n)[1] for shard in done)
+        missing += shards - len(done)
+    return LabelCounts(n, labels, missing)
+
+
+def find_scene(runs: Sequence[Run], scene: int) -> tuple[Run, int]:
+    """Return the run with scene `scene` of consecutive runs, and the scene's index in it.
+
+    InputError where there are fewer scenes.
+    """
+    left = scene
+    for run in runs:
+        scenes = -(-run.n // run.layout.candidates_per_scene)
+        if 0 <= left < scenes:
+            return run, left
+        left -= scenes
+    last = scene - left - 1
+    problem = f"{scene} is not in this run" if len(runs) == 1 else f"{scene} is in none of these runs"
+    raise InputError(runs[0].storage.url, "--scene", problem, f"Give one from 0 to {last}")

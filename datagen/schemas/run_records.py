@@ -1,13 +1,18 @@
-"""The JSON records of a run: manifest, plan, commit, ledger entries, quarantine.
+"""The JSON records of a run: manifest, plan, commit, ledger entries, quarantine; shards and costs in them.
 
-They are validated when read from disk.
+Records are validated when read from disk.
 """
 
 from __future__ import annotations
 
+import time
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from hashlib import sha256
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, overload
 
+import numpy as np
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -180,9 +185,9 @@ def foreign_field(manifest: Manifest, shard: int, commit: Commit) -> tuple[str, 
 
 def other_value(record: StoredRecord, **expected: object) -> tuple[str, str] | None:
     """(field, problem) of the first field with another value; None where there is none."""
-    for field, value in expected.items():
-        if (given := getattr(record, field)) not in (None, value):
-            return field, f"is {given}, but {value} in this run"
+    for name, value in expected.items():
+        if (given := getattr(record, name)) not in (None, value):
+            return name, f"is {given}, but {value} in this run"
     return None
 
 
@@ -225,3 +230,130 @@ class QuarantineRecord(StoredRecord):
     causes: tuple[str, ...]
     stacks: tuple[str, ...]
     created: str
+
+
+Bounds = np.ndarray[Any, np.dtype[np.int64]]
+
+
+class ShardRanges(Sequence[int]):
+    """An immutable set of shard numbers, 16 bytes per range of consecutive ones.
+
+    `bounds` is an int64 array (ranges, 2): first and one past the last shard of each, ascending, disjoint.
+    """
+
+    def __init__(self, bounds: Bounds) -> None:
+        self.bounds = bounds
+        self._ends = np.cumsum(bounds[:, 1] - bounds[:, 0])  # shards up to the end of each range
+
+    @classmethod
+    def of(cls, shards: Iterable[int] | Bounds) -> ShardRanges:
+        """The set of the given shards, in any order."""
+        if isinstance(shards, ShardRanges):
+            return shards
+        if isinstance(shards, range) and shards.step == 1:
+            bounds = [(shards.start, shards.stop)] if shards else []
+            return cls(np.array(bounds, np.int64).reshape(-1, 2))
+        numbers = np.unique(shards if isinstance(shards, np.ndarray) else np.fromiter(shards, np.int64))
+        if not len(numbers):
+            return cls(np.empty((0, 2), np.int64))
+        breaks = np.flatnonzero(np.diff(numbers) > 1)
+        first = numbers[np.concatenate([[0], breaks + 1])]
+        last = numbers[np.concatenate([breaks, [len(numbers) - 1]])]
+        return cls(np.stack([first, last + 1], axis=1))
+
+    def within(self, others: ShardRanges) -> ShardRanges:
+        return self.without(self.without(others))
+
+    def without(self, others: ShardRanges) -> ShardRanges:
+        # Sweep over all bounds: +1 within this set and -1 within the other, so 1 where only this one is.
+        numbers = np.concatenate([*self.bounds.T, *others.bounds.T])
+        steps = np.repeat([1, -1, -1, 1], [len(self.bounds)] * 2 + [len(others.bounds)] * 2)
+        order = np.argsort(numbers, kind="stable")
+        numbers, depth = numbers[order], np.cumsum(steps[order])
+        last = np.append(numbers[1:] != numbers[:-1], True) if len(numbers) else np.empty(0, bool)
+        numbers, inside = numbers[last], (depth[last] == 1)
+        edges = np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8))
+        first, past = numbers[np.flatnonzero(edges == 1)], numbers[np.flatnonzero(edges == -1)]
+        return ShardRanges(np.stack([first, past], axis=1).reshape(-1, 2))
+
+    def __len__(self) -> int:
+        return int(self._ends[-1]) if len(self._ends) else 0
+
+    def __iter__(self) -> Iterator[int]:
+        for first, past in self.bounds:
+            yield from range(int(first), int(past))
+
+    @overload
+    def __getitem__(self, index: int) -> int: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[int]: ...
+
+    def __getitem__(self, index: int | slice) -> int | list[int]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        if not -len(self) <= index < len(self):
+            raise IndexError(index)
+        at = index % len(self)
+        row = int(np.searchsorted(self._ends, at, side="right"))
+        return int(self.bounds[row, 1] - (self._ends[row] - at))
+
+    def position_of(self, shard: int) -> int:
+        """The position of one of its shards, in ascending order."""
+        row = int(np.searchsorted(self.bounds[:, 1], shard, side="right"))
+        return int(self._ends[row] - (self.bounds[row, 1] - shard))
+
+    def __contains__(self, shard: object) -> bool:
+        if not isinstance(shard, int):
+            return False
+        row = int(np.searchsorted(self.bounds[:, 1], shard, side="right"))
+        return row < len(self.bounds) and bool(self.bounds[row, 0] <= shard)
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, ShardRanges):
+            return np.array_equal(self.bounds, other.bounds)
+        return (
+            isinstance(other, Sequence)
+            and len(self) == len(other)
+            and all(a == b for a, b in zip(self, other, strict=True))
+        )
+
+    def __hash__(self) -> int:
+        return hash(self.bounds.tobytes())
+
+    def __repr__(self) -> str:
+        shown = ", ".join(f"{first}-{past - 1}" for first, past in self.bounds[:10])
+        return f"ShardRanges({shown}{', ...' if len(self.bounds) > 10 else ''})"
+
+
+STAGES = ("draw", "settle", "observe", "visibility", "grasps", "plan", "execute", "write")
+
+
+@dataclass
+class StageClock:
+    """Adds up wall and CPU seconds by stage.
+
+    CPU seconds are those of the whole process, so that threads of libraries count. The time of a nested stage
+    is subtracted from the outer one, so that every second counts once.
+    """
+
+    wall_s: dict[str, float] = field(default_factory=dict)
+    cpu_s: dict[str, float] = field(default_factory=dict)
+    _inner: list[tuple[float, float]] = field(default_factory=list)  # (wall, CPU) spent within open stages
+
+    @contextmanager
+    def stage(self, name: str) -> Generator[None]:
+        if name not in STAGES:
+            raise KeyError(f"unknown stage {name!r}; stages are {', '.join(STAGES)}")
+        wall, cpu = time.perf_counter(), time.process_time()
+        self._inner.append((0.0, 0.0))
+        try:
+            yield
+        finally:
+            wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+            inner_wall, inner_cpu = self._inner.pop()
+            self.wall_s[name] = self.wall_s.get(name, 0.0) + wall - inner_wall
+            self.cpu_s[name] = self.cpu_s.get(name, 0.0) + cpu - inner_cpu
+            if self._inner:
+                outer_wall, outer_cpu = self._inner[-1]
+                self._inner[-1] = (outer_wall + wall, outer_cpu + cpu)

@@ -11,8 +11,8 @@ import xarray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
-from datagen.schemas.description import cf_attributes, described
 from datagen.schemas.fields import Table
+from datagen.schemas.shard_files import cf_attributes, described
 from datagen.schemas.shard_reading import ShardPlace, StoredArray
 from datagen.tables.stored_fields import fields_of, refuse_unknown
 from datagen.train.run_parts import RunPart, open_parts, refuse_twins

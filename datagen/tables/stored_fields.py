@@ -7,7 +7,7 @@ from pathlib import Path
 
 from datagen.schemas.errors import InputError, choices
 from datagen.schemas.fields import SCHEMAS, Field, Table
-from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.run import open_runs
 from datagen.train.run_parts import is_sealed_store, open_sealed
 
 

@@ -18,7 +18,7 @@ from scipy import ndimage
 from scipy.special import ndtri
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import read_regular
+from datagen.schemas.safe_files import read_regular
 from datagen.train.inputs import F64, Bools
 
 _RINGS, _ANGLES = 8, 16

@@ -13,9 +13,9 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import TypedDict  # pydantic reads typing's from Python 3.12 on
 
-from datagen.schemas.concurrent_map import concurrent_map
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import Specification
+from datagen.schemas.storage import concurrent_map
 from datagen.train.augment import Augmentation
 from datagen.train.batching import (
     SAMPLE_FIELDS,

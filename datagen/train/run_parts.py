@@ -10,9 +10,8 @@ from typing import Any
 
 from datagen.schemas.errors import InputError, choices
 from datagen.schemas.fields import SCHEMA_VERSION, SCHEMAS
-from datagen.schemas.keys import MERGED
-from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.run import Run
+from datagen.schemas.record_files import MERGED
+from datagen.schemas.run import Run, open_runs
 from datagen.schemas.shard_reading import MAX_META_BYTES, ShardPlace, StoredArray, committed_place
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage

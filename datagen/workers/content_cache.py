@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from datagen.schemas.archives import DAMAGED_ARRAY, DAMAGED_ZIP
-from datagen.schemas.whole_files import whole_file
+from datagen.schemas.safe_files import DAMAGED_ARRAY, DAMAGED_ZIP, whole_file
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 

@@ -12,8 +12,7 @@ import numpy as np
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.protocol import AttemptReport, JobSummary, JobTotals, StopRequest
 from datagen.cluster.shard_policy import RetryPolicy, ShardFailures
-from datagen.schemas.run_records import Commit, Cost, Host
-from datagen.schemas.shard_ranges import ShardRanges
+from datagen.schemas.run_records import Commit, Cost, Host, ShardRanges
 from tests.cluster.simulated import FakeClock, Heard, PaperRecorder, report_of
 
 # Share of attempts, and how they end. What is silent never ends by itself.

@@ -8,7 +8,7 @@ from typing import TypeVar
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.protocol import AttemptReport, JobSummary, StopRequest
 from datagen.cluster.shard_policy import RetryPolicy
-from datagen.schemas.shard_ranges import ShardRanges
+from datagen.schemas.run_records import ShardRanges
 from tests.cluster.simulated import FakeClock, Fate, Heard, PaperRecorder, SimulatedExecutor
 
 T = TypeVar("T")

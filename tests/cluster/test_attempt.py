@@ -15,7 +15,7 @@ from datagen.cluster import attempt
 from datagen.cluster.attempt import run_attempt
 from datagen.cluster.attempt_guard import Meter, guarded
 from datagen.cluster.protocol import JobCannotContinue, ShardTask
-from datagen.schemas.keys import commit_copy_key, commit_key, shard_folder
+from datagen.schemas.record_files import commit_copy_key, commit_key, shard_folder
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
 from datagen.schemas.specification import (

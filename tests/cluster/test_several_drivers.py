@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datagen.cluster.shard_policy import OpenShards
-from datagen.schemas.shard_ranges import ShardRanges
+from datagen.schemas.run_records import ShardRanges
 from tests.cluster.several_drivers import drive_together, waste
 
 

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from datagen.schemas.keys import commit_copy_key, commit_key
-from datagen.schemas.record_files import encode_record
+from datagen.schemas.record_files import commit_copy_key, commit_key, encode_record
 from datagen.schemas.run import Run
-from datagen.schemas.scene_rows import read_shard
 from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.shard_reading import read_shard
 
 Columns = dict[str, np.ndarray[Any, Any]]
 

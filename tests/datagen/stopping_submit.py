@@ -13,7 +13,7 @@ import sys
 from unittest import mock
 
 from datagen import cli
-from datagen.schemas.ledger import Ledger
+from datagen.schemas.record_files import Ledger
 
 
 def _main() -> None:

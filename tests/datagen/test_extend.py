@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from datagen import cli
 from datagen.commands.resume import shares
-from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.run import open_runs
 from tests.refusals import refused
 from tests.small_runs import (
     HERE,

@@ -11,8 +11,7 @@ import pytest
 import zarr
 
 from datagen import cli
-from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.run import Run
+from datagen.schemas.run import Run, open_runs
 from datagen.train.reader import SampleReader
 from tests.made_runs import make_run
 from tests.refusals import refused

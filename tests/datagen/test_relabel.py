@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from datagen.schemas.keys import commit_key, shard_folder
-from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.record_files import encode_record
-from datagen.schemas.run import Run
+from datagen.schemas.record_files import commit_key, encode_record, shard_folder
+from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import Commit
 from datagen.train.run_parts import open_parts
 from tests.datagen.forged import forge

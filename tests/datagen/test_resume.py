@@ -14,10 +14,9 @@ import datagen.commands.submit
 from datagen import cli
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.jobs.job import Job, JobOptions, JobRun
-from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lifted_records
 from datagen.schemas.record_files import encode_record
-from datagen.schemas.run import Run
+from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import Manifest, QuarantineRecord
 from tests.refusals import refused
 from tests.small_runs import (

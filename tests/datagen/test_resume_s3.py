@@ -12,7 +12,7 @@ import pytest
 
 from datagen import cli
 from datagen.schemas.jobs import Jobs
-from datagen.schemas.keys import commit_key
+from datagen.schemas.record_files import commit_key
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import QuarantineRecord
 from datagen.schemas.storage import open_storage

@@ -14,7 +14,7 @@ from datagen.display.styles import OUTCOME_STYLES
 from datagen.drawing.scene_picture import best_success
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
-from datagen.schemas.scene_rows import read_scene
+from datagen.schemas.shard_reading import read_scene
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
 from datagen.workers.world import open_world
 from tests.refusals import refused

@@ -22,9 +22,9 @@ from datagen.cluster.protocol import AttemptResult, StopRequest
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.shard_policy import OpenShards, RetryPolicy
 from datagen.reports.spending import account_for
-from datagen.schemas.cost import StageClock
-from datagen.schemas.keys import commit_key
+from datagen.schemas.record_files import commit_key
 from datagen.schemas.run import Run
+from datagen.schemas.run_records import StageClock
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_files import encode_shard
 from tests.cluster.simulated import Heard

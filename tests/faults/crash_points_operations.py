@@ -15,11 +15,9 @@ from datagen.schemas.checking.cleaning import clean_runs
 from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS, RecordSchema
-from datagen.schemas.keys import MERGED, part_folder
-from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.merging import merge_runs, plan_merge
-from datagen.schemas.record_files import encode_record, publish
-from datagen.schemas.run import Run
+from datagen.schemas.record_files import MERGED, encode_record, part_folder, publish
+from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import Layout, LedgerEntry, Merged, QuarantineRecord
 from datagen.schemas.sealing import SEALED, seal, unseal
 from datagen.schemas.storage import open_storage

@@ -17,9 +17,8 @@ from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
 from datagen.schemas.checking.repair import Repaired, repair_runs
 from datagen.schemas.fields import SCHEMAS
-from datagen.schemas.keys import SET_ASIDE
-from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.run import Run
+from datagen.schemas.record_files import SET_ASIDE
+from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import LedgerEntry
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import open_storage

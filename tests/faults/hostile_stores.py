@@ -15,8 +15,7 @@ import google_crc32c
 import numpy as np
 from numcodecs.zstd import Zstd
 
-from datagen.schemas.keys import commit_copy_key, commit_key
-from datagen.schemas.record_files import signed_json
+from datagen.schemas.record_files import commit_copy_key, commit_key, signed_json
 from datagen.schemas.run import Run
 
 ATTEMPT = "shards/000001/a-1"

@@ -18,7 +18,7 @@ from datagen.cluster.protocol import AttemptResult, StopRequest
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.errors import InputError
-from datagen.schemas.keys import commit_copy_key, shard_folder
+from datagen.schemas.record_files import commit_copy_key, shard_folder
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
 from datagen.schemas.sealing import seal

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from datagen.schemas.keys import MERGED, part_folder
-from datagen.schemas.record_files import encode_record, publish
+from datagen.schemas.record_files import MERGED, encode_record, part_folder, publish
 from datagen.schemas.run_records import LedgerEntry, Merged, QuarantineRecord
 from datagen.schemas.sealing import SEALED, seal
 from datagen.schemas.storage import open_storage

@@ -10,10 +10,8 @@ import pytest
 
 from datagen import cli
 from datagen.schemas.errors import InputError
-from datagen.schemas.keys import commit_copy_key, commit_key
-from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.record_files import encode_record
-from datagen.schemas.run import Run
+from datagen.schemas.record_files import commit_copy_key, commit_key, encode_record
+from datagen.schemas.run import Run, open_runs
 from tests.faults.damage_campaign import copy_run, fewer_arrays, findings_at, repair_at
 from tests.faults.swap_campaign import Swap, Swaps, exchange, make_world, swaps, try_swap
 from tests.made_runs import attempt, files_of, make_run, small_spec, write

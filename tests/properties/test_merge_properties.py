@@ -21,13 +21,12 @@ from datagen.reports.spending import Spending, account_for
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
-from datagen.schemas.keys import shard_folder
-from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.merging import merge_runs, plan_merge
-from datagen.schemas.run import Run
+from datagen.schemas.record_files import shard_folder
+from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import Cost, LedgerEntry, QuarantineRecord
-from datagen.schemas.scene_rows import read_shard
 from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.shard_reading import read_shard
 from datagen.schemas.storage import open_storage
 from tests.faults.crash_points_operations import small_schema
 from tests.made_runs import commit_of, files_of, make_run, rows_of, small_spec, write

@@ -27,12 +27,10 @@ from datagen.schemas.checking.cleaning import clean_runs
 from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
-from datagen.schemas.keys import commit_key, shard_folder
-from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.quarantine import lift_quarantine
-from datagen.schemas.record_files import utc_now
-from datagen.schemas.run import Run
+from datagen.schemas.record_files import commit_key, shard_folder, utc_now
+from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import QuarantineRecord
 from datagen.schemas.sealing import SEALED, seal, unseal
 from datagen.schemas.specification import HeuristicParams

@@ -14,8 +14,15 @@ import pytest
 from datagen.schemas.checking.cleaning import clean_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobRecord, Jobs, JobState, new_job_id
-from datagen.schemas.keys import MERGED, commit_copy_key, commit_key, part_folder, shard_folder
-from datagen.schemas.record_files import encode_record, utc_now
+from datagen.schemas.record_files import (
+    MERGED,
+    commit_copy_key,
+    commit_key,
+    encode_record,
+    part_folder,
+    shard_folder,
+    utc_now,
+)
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Merged
 from datagen.schemas.sealing import seal

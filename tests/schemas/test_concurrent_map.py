@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.schemas.concurrent_map import concurrent_map
+from datagen.schemas.storage import concurrent_map
 
 
 @given(st.integers(0, 30), st.integers(1, 5), st.integers(1, 9))

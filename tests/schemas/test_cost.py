@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from datagen.schemas import cost
-from datagen.schemas.cost import StageClock
+from datagen.schemas import run_records
+from datagen.schemas.run_records import StageClock
 
 
 class Hands:
@@ -13,8 +13,8 @@ class Hands:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now_s = 0.0
-        monkeypatch.setattr(cost.time, "perf_counter", lambda: self.now_s)
-        monkeypatch.setattr(cost.time, "process_time", lambda: self.now_s / 2)
+        monkeypatch.setattr(run_records.time, "perf_counter", lambda: self.now_s)
+        monkeypatch.setattr(run_records.time, "process_time", lambda: self.now_s / 2)
 
 
 def test_a_stage_within_another_is_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:

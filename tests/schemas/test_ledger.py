@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 
 from datagen.schemas.checking.finding import Finding, Restore, SetAside
-from datagen.schemas.ledger import end_from_commit, lost_end
 from datagen.schemas.quarantine import lift_quarantine
-from datagen.schemas.record_files import decode_record
+from datagen.schemas.record_files import decode_record, end_from_commit, lost_end
 from datagen.schemas.run import Run, commit_copy_key, commit_key
 from datagen.schemas.run_records import AttemptStart, Cost, LedgerEntry, Outcome, QuarantineRecord
 from tests.faults.damage_campaign import fewer_arrays

@@ -10,13 +10,11 @@ import pytest
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
-from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.lineage import LINEAGE, Lineage, lineage_summary
-from datagen.schemas.merged_runs import find_scene, label_counts, open_runs
 from datagen.schemas.merging import MergeResult, merge_runs, plan_merge
-from datagen.schemas.merging.ledgers import GUESS_CAUSE, SPARE_CAUSE
-from datagen.schemas.record_files import read_record
-from datagen.schemas.run import Run
+from datagen.schemas.merging.writing import GUESS_CAUSE, SPARE_CAUSE
+from datagen.schemas.record_files import MERGED, part_folder, read_record
+from datagen.schemas.run import Run, find_scene, label_counts, open_runs
 from datagen.schemas.run_records import LedgerEntry, QuarantineRecord
 from datagen.schemas.sealing import seal, sealed_root
 from datagen.schemas.shard_files import encode_shard

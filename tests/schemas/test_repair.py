@@ -13,9 +13,16 @@ from datagen.schemas.checking.finding import Finding
 from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobRecord, Jobs, new_job_id
-from datagen.schemas.keys import MERGED, commit_copy_key, commit_key, part_folder
 from datagen.schemas.merging import merge_runs, plan_merge
-from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record, utc_now
+from datagen.schemas.record_files import (
+    MAX_RECORD_BYTES,
+    MERGED,
+    commit_copy_key,
+    commit_key,
+    encode_record,
+    part_folder,
+    utc_now,
+)
 from datagen.schemas.run_records import Cost, LedgerEntry
 from datagen.schemas.storage import open_storage
 from tests.faults.damage_campaign import (

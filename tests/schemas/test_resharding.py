@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.schemas.merging.resharding import Cut, base_name, common_layout, rank
+from datagen.schemas.merging.plan import Cut, base_name, common_layout, rank
 from datagen.schemas.run_records import AttemptStart, Cost, Layout
 
 seconds = st.floats(0, 1e6)

@@ -20,7 +20,6 @@ from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import SEALED, seal
-from datagen.schemas.sealing import local as seal_local
 from datagen.schemas.specification import Source
 from tests.made_runs import check_digests, files_of, make_run, rows_of, small_spec, write
 
@@ -237,7 +236,7 @@ def test_where_names_cannot_be_exchanged_two_renames_do(tmp_path: Path):
     seal(run.storage)
     grown = make_run(tmp_path, n=37)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(seal_local, "_exchange", lambda one, other: False)
+        patch.setattr("datagen.schemas.sealing._exchange", lambda one, other: False)
         seal(grown.storage)
         assert_equal(zarr.open_group(tmp_path / SEALED, mode="r"), expected(grown, [0, 1, 2, 3], 8, 37))
         before = files_of(tmp_path)

@@ -9,10 +9,8 @@ import pytest
 import zarr
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.keys import MERGED, part_folder
-from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.record_files import encode_record
-from datagen.schemas.run import Run
+from datagen.schemas.record_files import MERGED, encode_record, part_folder
+from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import Merged
 from datagen.schemas.sealing import SEALED, seal, sealed_root, unseal
 from datagen.schemas.storage import Storage, open_storage

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import open_regular, read_regular
+from datagen.schemas.safe_files import open_regular, read_regular
 
 
 def test_a_regular_file_is_read_up_to_its_bound(tmp_path: Path) -> None:

@@ -13,8 +13,14 @@ import pytest
 from datagen.schemas.checking.finding import Restore, SetAside
 from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError
-from datagen.schemas.keys import MERGED, commit_copy_key, commit_key, part_folder
-from datagen.schemas.record_files import encode_record, signed_json
+from datagen.schemas.record_files import (
+    MERGED,
+    commit_copy_key,
+    commit_key,
+    encode_record,
+    part_folder,
+    signed_json,
+)
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, Merged, Plan, QuarantineRecord
 from datagen.schemas.sealing import seal

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from datagen.schemas.fields import RecordSchema
-from datagen.schemas.keys import commit_copy_key, commit_key
 from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.record_files import commit_copy_key, commit_key
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import LedgerEntry
 from datagen.schemas.shard_files import encode_shard

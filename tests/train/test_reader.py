@@ -16,9 +16,9 @@ from datagen.reports.agreement import read_labelled
 from datagen.schemas import shard_reading
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
-from datagen.schemas.scene_rows import read_scene
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.shard_reading import read_scene
 from datagen.train.dataset import SampleStream
 from datagen.train.reader import Columns, SampleReader
 from tests.made_runs import commit_of, make_run, rows_of, small_spec

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datagen.schemas.whole_files import whole_file
+from datagen.schemas.safe_files import whole_file
 from datagen.workers.content_cache import Arrays, CacheFolder
 from tests.other_user import as_another_user, needs_root
 

@@ -21,10 +21,19 @@ from datagen.schemas.checking.finding import (
     read,
 )
 from datagen.schemas.errors import InputError
-from datagen.schemas.keys import commit_copy_key, commit_key
-from datagen.schemas.ledger import end_from_commit, end_key, lost_end, start_from_end, start_key
 from datagen.schemas.quarantine import name_before
-from datagen.schemas.record_files import decode_record, encode_record, utc_now
+from datagen.schemas.record_files import (
+    commit_copy_key,
+    commit_key,
+    decode_record,
+    encode_record,
+    end_from_commit,
+    end_key,
+    lost_end,
+    start_from_end,
+    start_key,
+    utc_now,
+)
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import (
     AttemptStart,

@@ -19,12 +19,11 @@ from datagen.schemas.checking.finding import Finding, below
 from datagen.schemas.checking.roots import check_notes, check_plans, open_roots
 from datagen.schemas.checking.sealed import SealedTally, check_chunks, check_store, read_root, runs_named
 from datagen.schemas.checking.shards import ShardForm, check_shard, form_of
-from datagen.schemas.concurrent_map import concurrent_map
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
 from datagen.schemas.sealing.contents import SealedRun
-from datagen.schemas.storage import Storage
+from datagen.schemas.storage import Storage, concurrent_map
 
 _THREADS = 4  # hashing and decompression release the GIL
 _REMOTE_THREADS = 16  # requests mostly wait for the server

@@ -16,9 +16,8 @@ from itertools import groupby
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import Jobs
-from datagen.schemas.keys import commit_copy_key, commit_key
-from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.run import Run
+from datagen.schemas.record_files import commit_copy_key, commit_key
+from datagen.schemas.run import Run, open_runs
 from datagen.schemas.storage import Storage, StoredFile
 
 Seen = Callable[[int, int], None]

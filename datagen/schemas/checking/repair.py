@@ -16,11 +16,8 @@ from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.cleaning import refuse_running
 from datagen.schemas.checking.finding import Finding, Reseal, Restore, SetAside, read
 from datagen.schemas.errors import InputError
-from datagen.schemas.keys import SET_ASIDE, commit_key
-from datagen.schemas.ledger import end_key
-from datagen.schemas.merged_runs import label_counts, open_runs
-from datagen.schemas.record_files import encode_record
-from datagen.schemas.run import Run
+from datagen.schemas.record_files import SET_ASIDE, commit_key, encode_record, end_key
+from datagen.schemas.run import Run, label_counts, open_runs
 from datagen.schemas.run_records import LedgerEntry
 from datagen.schemas.sealing import seal, unseal
 from datagen.schemas.storage import Storage

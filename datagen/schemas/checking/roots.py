@@ -17,9 +17,8 @@ from datagen.schemas.checking.finding import (
     sound,
 )
 from datagen.schemas.errors import InputError
-from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.lineage import LINEAGE, Lineage
-from datagen.schemas.record_files import copy_key, encode_record, refuse_other_format
+from datagen.schemas.record_files import MERGED, copy_key, encode_record, part_folder, refuse_other_format
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import FORMAT_VERSION, Commit, Manifest, Merged, Plan, other_value
 from datagen.schemas.storage import Storage

@@ -12,21 +12,23 @@ from datagen.schemas.checking.finding import Finding, Reseal, curable
 from datagen.schemas.checking.shards import ShardForm, same_json
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import TABLES
-from datagen.schemas.keys import shard_folder
-from datagen.schemas.record_files import MAX_RECORD_BYTES
+from datagen.schemas.record_files import MAX_RECORD_BYTES, shard_folder
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Commit
+from datagen.schemas.run_records import Commit, ShardRanges
 from datagen.schemas.sealing.contents import (
     MOST_SHARDS,
+    ROOT,
+    SEALED,
     Contents,
     RowsDigest,
+    SealedRoot,
     SealedRun,
     SealedShard,
+    sealed_metadata,
+    sealed_root,
     with_last,
 )
-from datagen.schemas.sealing.metadata import ROOT, SEALED, SealedRoot, sealed_metadata, sealed_root
 from datagen.schemas.shard_files import chunk_key, rows_per_shard
-from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage
 
 

@@ -15,8 +15,8 @@ from datagen.schemas.checking.finding import Finding, SetAside, curable
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import Field, RecordSchema, Table
 from datagen.schemas.identity import sample_ids
-from datagen.schemas.keys import commit_key, shard_folder
 from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.record_files import commit_key, shard_folder
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, FileEntry
 from datagen.schemas.shard_files import MAX_TEXT_BYTES, chunk_paths, group_metadata, rows_per_shard

@@ -7,13 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.keys import MERGED, part_folder
-from datagen.schemas.merged_runs import label_counts, open_runs
-from datagen.schemas.merging.plan import Union, plan_union, refuse_incompatible
-from datagen.schemas.merging.resharding import common_layout
+from datagen.schemas.merging.plan import Union, common_layout, plan_union, refuse_incompatible
 from datagen.schemas.merging.writing import WrittenUnion, begin_union, replace_record, write_union
-from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record, refuse_foreign
-from datagen.schemas.run import Run
+from datagen.schemas.record_files import MAX_RECORD_BYTES, MERGED, encode_record, part_folder, refuse_foreign
+from datagen.schemas.run import Run, label_counts, open_runs
 from datagen.schemas.run_records import Layout, Merged
 from datagen.schemas.sealing import SEALED, seal, sealed_metadata
 from datagen.schemas.sealing.contents import read_contents

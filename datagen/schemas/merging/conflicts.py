@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import RecordSchema, SceneRows
-from datagen.schemas.keys import shard_folder
+from datagen.schemas.record_files import shard_folder
 from datagen.schemas.run import Run
-from datagen.schemas.scene_rows import read_scenes
+from datagen.schemas.shard_reading import read_scenes
 
 
 def refuse_different_rows(one: Run, shard_one: int, other: Run, shard_other: int) -> None:

@@ -1,21 +1,35 @@
-"""The content of a sealed store: shards in order, and their files."""
+"""The content of a sealed store: shards in order, their files, and the zarr.json files over them."""
 
 from __future__ import annotations
 
+import json
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from itertools import chain
+from typing import Any
+
+import zarr
+from pydantic import BaseModel, ValidationError
+from zarr.core.buffer import default_buffer_prototype
+from zarr.storage import MemoryStore
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import Field, RecordSchema, Table
-from datagen.schemas.keys import part_folder, shard_folder
-from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.record_files import REPAIR
-from datagen.schemas.run import Run
-from datagen.schemas.run_records import Commit, Layout
-from datagen.schemas.shard_files import chunk_key, chunk_paths, group_metadata, rows_per_shard
-from datagen.schemas.shard_ranges import ShardRanges
+from datagen.schemas.fields import TABLES, Field, RecordSchema, Table
+from datagen.schemas.record_files import MAX_RECORD_BYTES, REPAIR, part_folder, shard_folder
+from datagen.schemas.run import Run, open_runs
+from datagen.schemas.run_records import Commit, Layout, ShardRanges
+from datagen.schemas.shard_files import (
+    cf_attributes,
+    chunk_key,
+    chunk_paths,
+    described,
+    group_metadata,
+    root_attributes,
+    rows_per_shard,
+    zarr_metadata,
+)
 from datagen.schemas.storage import Storage
 
 # Far above any real run.
@@ -194,3 +208,74 @@ def _refuse_odd_files(run: Run, commit: Commit, expected: frozenset[str]) -> Non
             f"{len(odd)} files are missing or extra, first {odd[0]}",
             REPAIR,
         )
+
+
+SEALED = "data.zarr"
+ROOT = "zarr.json"
+
+
+class SealedPart(BaseModel):
+    """One run in a sealed store: the samples wanted, and the missing shards."""
+
+    spec_hash: str
+    n: int
+    missing_shards: list[int]
+
+
+class SealedRoot(BaseModel):
+    """The content of the root zarr.json of a sealed store; one part for a single run."""
+
+    parts: list[SealedPart]
+    # sha256 over the digests of all files of its shards, in order; "" where unknown.
+    rows_sha256: str = ""
+
+    def part(self, spec_hash: str) -> SealedPart | None:
+        return next((part for part in self.parts if part.spec_hash == spec_hash), None)
+
+
+def sealed_root(storage: Storage) -> SealedRoot | None:
+    """Read the root of data.zarr in `storage`; None where it does not exist or has another form."""
+    data = storage.get(f"{SEALED}/{ROOT}", MAX_RECORD_BYTES)
+    if data is None:
+        return None
+    try:
+        attributes = json.loads(data)["attributes"]
+        if "parts" not in attributes:  # a single run
+            attributes = {"parts": [attributes], "rows_sha256": attributes.get("rows_sha256", "")}
+        return SealedRoot.model_validate(attributes)
+    except (ValueError, KeyError, TypeError, RecursionError, ValidationError):
+        return None
+
+
+def sealed_metadata(contents: Contents) -> dict[str, bytes]:
+    """zarr.json files of the store by path; the root's has consolidated metadata."""
+    first = contents.runs[0]
+    attributes = root_attributes(contents.schema, contents.layout, first.run.manifest.spec_hash)
+    if contents.is_merged:
+        del attributes["spec_hash"]
+        attributes["parts"] = [_part(run) for run in contents.runs]
+    else:
+        attributes |= _part(first)
+    attributes["rows_sha256"] = contents.digests[-1]
+    rows = {table: contents.rows(table) for table in TABLES}
+    specs = [part.run.manifest.spec for part in contents.runs]
+    attributes = described(specs, [part.n for part in contents.runs]) | attributes
+    of_arrays = {f.name: cf_attributes(f, table) for table, f in contents.schema.fields}
+    files = zarr_metadata(contents.schema, contents.layout, rows, attributes, of_arrays)
+    make = default_buffer_prototype().buffer.from_bytes
+    store = {path: make(data) for path, data in files.items()}
+    with warnings.catch_warnings():
+        # Consolidated metadata is not in the Zarr v3 specification yet; common readers support it.
+        warnings.simplefilter("ignore")
+        zarr.consolidate_metadata(MemoryStore(store), zarr_format=3)
+    return {path: buffer.to_bytes() for path, buffer in store.items()}
+
+
+def _part(sealed: SealedRun) -> dict[str, Any]:
+    return {
+        "spec_hash": sealed.run.manifest.spec_hash,
+        "n": sealed.n,
+        "shards": len(sealed.shards),
+        "missing_shards": list(sealed.missing_shards),
+        "specification": sealed.run.manifest.spec.document(),
+    }

@@ -15,13 +15,14 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from datagen.schemas.concurrent_map import concurrent_map
 from datagen.schemas.errors import InputError, refuse_not_utf8
 from datagen.schemas.storage.errors import FileTooLarge, storage_error
 from datagen.schemas.storage.local_files import LocalFiles, StoredFile
 
 if TYPE_CHECKING:
     from datagen.schemas.storage.remote_objects import RemoteObjects
+from collections.abc import Generator
+from concurrent.futures import Future, wait
 
 __all__ = ["Storage", "StoredFile", "open_storage", "storage_error"]
 
@@ -252,3 +253,33 @@ def _exhaust(results: Iterator[None]) -> None:
 @cache
 def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="store")
+
+
+Result = TypeVar("Result")
+Item = TypeVar("Item")
+
+
+def concurrent_map(
+    pool: ThreadPoolExecutor, most: int, do: Callable[[Item], Result], items: Iterable[Item]
+) -> Generator[Result]:
+    """Yield `do(item)` for each item in order, with a bounded number of results computed ahead.
+
+    The first exception ends it; no call is running after the iterator has ended. `items` is consumed in the
+    caller's thread, as needed. `do` must not wait for the pool that it runs in.
+    """
+    begun: deque[Future[Result]] = deque()
+    try:
+        for item in items:
+            begun.append(pool.submit(do, item))
+            if len(begun) >= most:
+                result = begun[0].result()
+                begun.popleft()
+                yield result
+        while begun:
+            result = begun[0].result()
+            begun.popleft()
+            yield result
+    finally:
+        for future in begun:
+            future.cancel()
+        wait(begun)

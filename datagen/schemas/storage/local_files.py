@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from datagen.schemas.safe_files import sync_folder
 from datagen.schemas.storage.errors import (
     NOT_LINKED,
     TAKEN,
@@ -23,7 +24,6 @@ from datagen.schemas.storage.errors import (
     storage_error,
     too_large,
 )
-from datagen.schemas.whole_files import sync_folder
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 # Enough to traverse a folder, without permission to read it.

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from datagen.schemas.archives import DAMAGED_ARRAY, DAMAGED_ZIP, open_member
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import read_regular
+from datagen.schemas.safe_files import DAMAGED_ARRAY, DAMAGED_ZIP, open_member, read_regular
 from datagen.train.inputs import F32, F64, U8, Array, Bools
 from datagen.workers.geometry.transforms import is_pose
 from datagen.workers.json_document import JsonNode, parse_json

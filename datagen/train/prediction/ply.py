@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import read_regular
+from datagen.schemas.safe_files import read_regular
 from datagen.train.inputs import F32, F64, U8, Bools
 from datagen.train.prediction.files import FILE_FIX, MAX_FILE_BYTES
 

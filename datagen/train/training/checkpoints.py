@@ -25,8 +25,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import read_regular
-from datagen.schemas.whole_files import whole_file
+from datagen.schemas.safe_files import read_regular, whole_file
 from datagen.train.dataset import DataOrigin
 from datagen.train.models import Model, build_model
 from datagen.train.training.validation import ValidationMetrics

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import read_regular
+from datagen.schemas.safe_files import read_regular
 from datagen.workers.json_document import JsonNode, parse_json
 
 TABLE_NAMES = ("asset_sizes.json", "asset-database.json")

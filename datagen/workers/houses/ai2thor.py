@@ -23,7 +23,7 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
-from datagen.schemas.untrusted_files import open_regular, read_regular
+from datagen.schemas.safe_files import open_regular, read_regular
 from datagen.workers.furniture.assets import CARRYING_TYPES
 from datagen.workers.geometry.mesh import F32, F64, Mesh
 from datagen.workers.geometry.transforms import rotation_of

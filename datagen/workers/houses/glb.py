@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import read_regular
+from datagen.schemas.safe_files import read_regular
 from datagen.workers.geometry.mesh import F64, U8, Mesh
 from datagen.workers.json_document import parse_json
 

@@ -19,10 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, cast
 
-from datagen.schemas.archives import DAMAGED_ZIP
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import open_regular
-from datagen.schemas.whole_files import whole_file
+from datagen.schemas.safe_files import DAMAGED_ZIP, open_regular, whole_file
 from datagen.workers.content_cache import cache_folder, drop_unused, refresh
 from datagen.workers.json_document import parse_json
 

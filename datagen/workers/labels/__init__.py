@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from datagen.schemas.cost import StageClock
+from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import Specification
 from datagen.workers.registry import entry
 

@@ -14,10 +14,10 @@ from functools import cached_property
 
 import numpy as np
 
-from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import ArmParams, DisturbanceParams, Specification
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.bases.clearance import base_clearance_m

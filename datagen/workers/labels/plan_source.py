@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from datagen.schemas.cost import StageClock
 from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import read_regular
+from datagen.schemas.safe_files import read_regular
 from datagen.workers.geometry.mesh import F32, F64, vertex_components
 from datagen.workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
 

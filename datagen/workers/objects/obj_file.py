@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import open_regular
+from datagen.schemas.safe_files import open_regular
 from datagen.workers.geometry.mesh import F64
 
 I64 = npt.NDArray[np.int64]

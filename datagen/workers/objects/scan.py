@@ -11,7 +11,7 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
-from datagen.schemas.untrusted_files import open_regular
+from datagen.schemas.safe_files import open_regular
 from datagen.workers.content_cache import Arrays, CacheFolder
 from datagen.workers.geometry.mesh import F32, Mesh, Texture
 from datagen.workers.objects.convex import ConvexParts, read_convex_parts

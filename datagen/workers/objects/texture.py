@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import open_regular, read_regular
+from datagen.schemas.safe_files import open_regular, read_regular
 from datagen.workers.geometry.mesh import F32, I32, U8
 
 MAX_FILE_BYTES = 256 * 2**20

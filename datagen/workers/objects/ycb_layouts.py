@@ -15,7 +15,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import read_regular
+from datagen.schemas.safe_files import read_regular
 from datagen.workers.json_document import parse_json
 from datagen.workers.objects.obj_file import read_obj_header
 from datagen.workers.objects.scan import ScanFiles, scan_files

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import read_regular
+from datagen.schemas.safe_files import read_regular
 from datagen.workers.geometry.mesh import F32, F64, I32
 from datagen.workers.robots.description import Parts
 from datagen.workers.robots.urdf import Shape

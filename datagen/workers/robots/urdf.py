@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.untrusted_files import read_regular
+from datagen.schemas.safe_files import read_regular
 from datagen.workers.geometry.mesh import F64
 
 _MAX_BYTES = 8 << 20

@@ -6,9 +6,9 @@ from collections import Counter
 
 import numpy as np
 
-from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import Stream, generator
+from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import CandidateParams, ObservationParams, SettleParams
 from datagen.workers.bases.candidates import SceneCandidates, draw_candidates
 from datagen.workers.bases.clearance import Obstacles, base_clearance_m

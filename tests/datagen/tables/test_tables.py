@@ -9,8 +9,8 @@ import pytest
 import xarray
 
 import datagen
-from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.merging import merge_runs, plan_merge
+from datagen.schemas.run import open_runs
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_reading import ShardPlace
 from datagen.workers.houses import split_of

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from datagen.schemas.cost import StageClock
+from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import NoiseParams, ObservationParams, Source, Specification
 from datagen.train.models import build_model
 from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame

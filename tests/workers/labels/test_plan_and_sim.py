@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.outcomes import OUTCOMES, RETRY_OUTCOMES
+from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import (
     ArmParams,
     CandidateParams,

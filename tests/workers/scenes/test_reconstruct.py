@@ -10,7 +10,7 @@ import pytest
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.run import Run
-from datagen.schemas.scene_rows import read_scenes
+from datagen.schemas.shard_reading import read_scenes
 from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_candidates, reconstruct_scene
 from datagen.workers.world import World, open_world
 from tests.small_runs import PER_SCENE, make_small_run

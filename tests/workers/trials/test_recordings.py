@@ -17,7 +17,7 @@ import pytest
 pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
 
 from datagen.configuration.specify import specify
-from datagen.schemas.cost import StageClock
+from datagen.schemas.run_records import StageClock
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, translation
 from datagen.workers.houses import open_houses
