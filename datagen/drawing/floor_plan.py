@@ -34,7 +34,7 @@ _HEAD_ROOM_M = 1.9  # higher parts, such as the wall over a door, are not drawn
 _KIND_EDGE = {"wall": "#303030", "furniture": "#6b5b4a", "small": "#8a6fb0"}
 _DOT_PT2, _SMALL_PT2 = 26, 11  # small: frequent outcomes of little interest
 _OF_LITTLE_INTEREST = ("out_of_reach", "base_collision")
-_LEGEND_CHARACTERS = 42
+_LEGEND_CHARACTERS = 60
 
 Handle = Line2D | Patch
 
@@ -42,11 +42,10 @@ Handle = Line2D | Patch
 def draw_plan(axes: Axes, recalled: ReconstructedScene, base_xy_m: F64) -> list[Handle]:
     """Draw house, placed objects and camera around the target, pale; return the legend.
 
-    The plan shows the camera and all base poses (N, 2).
+    The plan shows all base poses (N, 2), and the camera where it is among them.
     """
     x, y = (float(v) for v in recalled.target_center_m[:2])
-    shown_m = np.concatenate([base_xy_m, recalled.camera.T_world_camera[None, :2, 3]])
-    half_m = max(1.1, float(np.abs(shown_m - (x, y)).max()) + 0.2)
+    half_m = max(1.1, float(np.abs(base_xy_m - (x, y)).max()) + 0.12)
     for room in recalled.house.house.rooms:
         axes.add_patch(Polygon(room.polygon_m, closed=True, facecolor="#f4efe6", edgecolor="#c9bfae", lw=0.5))
     solid = [b for b in recalled.house.house.bodies if _height_m(b) > 0.01]
@@ -68,7 +67,8 @@ def draw_plan(axes: Axes, recalled: ReconstructedScene, base_xy_m: F64) -> list[
     _draw_camera(axes, recalled)
     axes.set(xlim=(x - half_m, x + half_m), ylim=(y - half_m, y + half_m), xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal")
-    marks = [CAMERA, TARGET, *([CLUTTER] if len(recalled.models) > 1 else [])]
+    is_near = bool((np.abs(recalled.camera.T_world_camera[:2, 3] - (x, y)) < half_m).all())
+    marks = [*([CAMERA] if is_near else []), TARGET, *([CLUTTER] if len(recalled.models) > 1 else [])]
     return [handle(style, style.words) for style in marks]
 
 
