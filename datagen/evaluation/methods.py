@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -214,25 +214,17 @@ def baseline_methods(
 
 
 def open_models(paths: Sequence[str]) -> list[EvaluatedMethod]:
-    """The models of these checkpoints, with unique names by regime; the released one has its own."""
+    """The models of these checkpoints, named by their files; the released one has its own name."""
     if not paths:
         return []
     from datagen.train.training.checkpoints import load_model
 
-    loaded = [(path, *load_model(path)) for path in paths]
-    released = str(released_checkpoint())
-    names = _names(
-        [(RELEASED if path == released else _regime_name(head), head.model) for path, _, head in loaded]
-    )
-    by_digest: dict[str, str] = {}
-    for path, _, head in loaded:
-        if head.digest in by_digest:
-            raise InputError(path, "", f"is the same checkpoint as {by_digest[head.digest]}", "Name it once")
-        by_digest[head.digest] = path
-    return [
-        EvaluatedMethod(name, ModelScorer(model, name, only_clear=True), path, head)
-        for (path, model, head), name in zip(loaded, names, strict=True)
-    ]
+    found: list[EvaluatedMethod] = []
+    for path in paths:
+        model, head = load_model(path)
+        name = RELEASED if path == str(released_checkpoint()) else Path(path).stem
+        found.append(EvaluatedMethod(name, ModelScorer(model, name, only_clear=True), path, head))
+    return found
 
 
 def open_methods(
@@ -240,25 +232,18 @@ def open_methods(
 ) -> list[EvaluatedMethod]:
     """Checkpoints, baselines and files of scores, in the order in which they are named.
 
-    InputError for an unknown method, for two methods of one name, and where `fit` and `runs` share a house.
+    InputError for an unknown method, and where `fit` and `runs` share a house.
     """
     kinds = {each: _kind(each) for each in named}
     checkpoints = [each for each, kind in kinds.items() if kind == "checkpoint"]
     paths = [str(released_checkpoint()) if each == RELEASED else each for each in checkpoints]
-    found = {
-        each: replace(model, name=each if each == RELEASED else Path(each).stem)
-        for each, model in zip(checkpoints, open_models(paths), strict=True)
-    }
+    found = dict(zip(checkpoints, open_models(paths), strict=True))
     if baselines := [each for each, kind in kinds.items() if kind == "baseline"]:
         made = baseline_methods(baselines, fit, runs, json=json)
         found |= dict(zip(baselines, made.baselines, strict=True))
     files = {each: read_scores(Path(each)) for each, kind in kinds.items() if kind == "scores"}
     found |= {each: EvaluatedMethod(f.name, f, note="scores of a file") for each, f in files.items()}
-    methods = [found[each] for each in kinds]
-    for name, count in Counter(method.name for method in methods).items():
-        if count > 1:
-            raise InputError("METHOD", name, "is the name of two methods", "Rename one of the files")
-    return methods
+    return [found[each] for each in kinds]
 
 
 def _kind(named: str) -> str:
@@ -289,7 +274,13 @@ def refuse_seen_houses(
 def score_runs(
     runs: Sequence[EvaluatedRun], methods: Sequence[EvaluatedMethod], json: bool, n_examples: int = 0
 ) -> Gathered:
-    """The columns of all runs in stored order, and `n_examples` scenes to show, with progress."""
+    """The columns of all runs in stored order, and `n_examples` scenes to show, with progress.
+
+    InputError for two methods of one name.
+    """
+    for name, count in Counter(method.name for method in methods).items():
+        if count > 1:
+            raise InputError("METHOD", name, "is the name of two methods", "Rename one of the files")
     with counting("scenes", json) as seen:
         total, done = sum(run.stream.n_scenes for run in runs), 0
 
@@ -307,20 +298,3 @@ def house_share(head: CheckpointHead) -> float:
     """Share of the available houses that the model was trained on."""
     share = head.options.get("house_share", 1.0)
     return float(share) if isinstance(share, (int, float)) else 1.0
-
-
-def _regime_name(head: CheckpointHead) -> str:
-    regime, share = REGIMES.get(head.stage, head.stage), house_share(head)
-    return regime if share == 1 else f"{regime} {share:.0%}"
-
-
-def _names(known: Sequence[tuple[str, str]]) -> list[str]:
-    """A name for each (regime, model): the regime alone, with the model, or with a number as well."""
-    regimes, both = Counter(regime for regime, _ in known), Counter(known)
-    numbers: Counter[tuple[str, str]] = Counter()
-    names: list[str] = []
-    for regime, model in known:
-        numbers[regime, model] += 1
-        name = regime if regimes[regime] == 1 else f"{regime} {model}"
-        names.append(name if both[regime, model] == 1 else f"{name} {numbers[regime, model]}")
-    return names

@@ -17,7 +17,6 @@ from datagen.evaluation.report_tables import (
     loop_tables,
     notes,
     set_tables,
-    source_tables,
 )
 
 if TYPE_CHECKING:
@@ -90,4 +89,3 @@ def blocks(report: Report, gathered: Gathered | None = None) -> Iterator[str | T
         yield "Example grids"
         draw = partial(figures.draw_examples, gathered.examples, gathered.columns, report["methods"])
         yield Picture(draw, figures.GRIDS_CAPTION)
-    yield from source_tables(report)

@@ -235,23 +235,6 @@ def loop_tables(report: Report) -> Iterator[Table]:
     yield Table(title, ("arrival", "distinct arrivals", *shares.values()), agreement, detail=True)
 
 
-def source_tables(report: Report) -> Iterator[Table]:
-    """The runs and checkpoints behind the numbers."""
-    runs = [
-        (run["place"], part["label_source"], part["split"], part["candidates"], str(part["per_scene"]),
-         part["spec_hash"])
-        for run in report["runs"] for part in run["parts"]
-    ]  # fmt: skip
-    heads = ("run", "labels", "split", "candidates", "candidates per scene", "specification")
-    yield Table("runs", heads, runs, detail=True)
-    checkpoints = [
-        (record["name"], checkpoint["file"], checkpoint["model"], checkpoint["sha256"])
-        for record in report["methods"]
-        if (checkpoint := record["checkpoint"])
-    ]
-    yield Table("checkpoints", ("method", "file", "model", "sha256"), checkpoints, detail=True)
-
-
 def notes(report: Report) -> list[tuple[str, str]]:
     """Return the notes on the numbers: (subject, note)."""
     boot = report["bootstrap"]
@@ -268,6 +251,11 @@ def notes(report: Report) -> list[tuple[str, str]]:
         )
     if any(record["threshold"] is None for record in report["methods"]):
         found.append(("*", "has no threshold: its choice for each robot is positive, the rest negative"))
+    found += [
+        (f"run {run['place']}", f"{part['label_source']} labels, split {part['split']}, {part['per_scene']} "
+         f"{part['candidates']} candidates a scene, specification {part['spec_hash'][:12]}")
+        for run in report["runs"] for part in run["parts"]
+    ]  # fmt: skip
     if report["fitted_on"]:
         found.append(("baselines", f"fitted on {', '.join(report['fitted_on'])}"))
     if loop := report.get("closed_loop"):
@@ -277,7 +265,12 @@ def notes(report: Report) -> list[tuple[str, str]]:
                          f"{count['wanted']:,} in all, {count['distinct']:,} of them distinct"),
             ("closed loop", f"leaves out {loop['scenes_without_good']} grids without a good clear cell"),
         ]  # fmt: skip
-    found += [(record["name"], record["note"]) for record in report["methods"] if record["note"]]
+    for record in report["methods"]:
+        if (head := record["checkpoint"]) is not None:
+            told = f"{head['model']} ({record['regime']}), weights {head['weights_sha256'][:12]}"
+            found.append((record["name"], f"{head['file']}: {told}"))
+        elif record["note"]:
+            found.append((record["name"], record["note"]))
     return found + [(name, f"omitted: {why}") for name, why in report["left_out"].items()]
 
 
@@ -292,7 +285,7 @@ def _benchmark_notes(benchmark: Report | None) -> Iterator[tuple[str, str]]:
             if digests
             else "not frozen: its candidates and labels were not compared"
         )
-        yield f"run {name}", f"{run['about']}; specification {run['spec_hash'][:12]}, {frozen}"
+        yield name, f"{run['about']}; {frozen}"
     yield "grids", f"mixed: good and bad clear cells; hard: at most {HARD_SHARE:.0%} of the clear cells good"
     if benchmark["not_scored"]:
         yield "not scored", f"{', '.join(benchmark['not_scored'])}: every row is incomplete"

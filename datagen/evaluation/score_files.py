@@ -6,10 +6,8 @@ as good. Without that line scores are probabilities, and the threshold is 0.5.
 
 from __future__ import annotations
 
-import csv
 import math
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,46 +49,31 @@ class ScoreFile:
 
 def read_scores(path: Path) -> ScoreFile:
     """Read the file. InputError names the first wrong line."""
-    data = read_regular(path, _MOST_BYTES, "Name a CSV file of scores")
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(path, "", "is not UTF-8 text", _FIX) from None
-    lines = text.splitlines()
-    threshold, first = None, 0
-    while first < len(lines) and lines[first].startswith("#"):
-        if stated := _THRESHOLD.fullmatch(lines[first]):
-            threshold = _number(path, first + 1, "threshold", stated[1])
-        first += 1
-    scores = _scores(path, lines[first:], first)
-    is_probability = threshold is None
-    if is_probability:
-        for key, score in scores.items():
-            if not 0 <= score <= 1:
-                problem = f"{score:g} of {key.hex()} is no probability, and no threshold is stated"
-                raise InputError(path, "score", problem, "Begin the file with a line: # threshold: NUMBER")
-    return ScoreFile(path.stem, str(path), 0.5 if threshold is None else threshold, is_probability, scores)
-
-
-def _scores(path: Path, lines: Iterable[str], before: int) -> dict[bytes, float]:
-    """Scores by id; `before` is the number of lines before the first of these."""
-    rows = csv.reader(lines)
+    text = read_regular(path, _MOST_BYTES, "Name a CSV file of scores").decode("utf-8-sig", errors="replace")
+    threshold, has_head = None, False
     scores: dict[bytes, float] = {}
-    try:
-        if tuple(name.strip() for name in next(rows, ())) != HEAD:
-            raise InputError(path, f"line {before + 1}", f"is not {','.join(HEAD)}", _FIX)
-        for row in rows:
-            line = before + rows.line_num
-            if len(row) != 2 or not _ID.fullmatch(row[0]):
-                problem = "is not an id of 32 hexadecimal digits and a score"
-                raise InputError(path, f"line {line}", problem, _FIX)
-            key = bytes.fromhex(row[0])
-            if key in scores:
-                raise InputError(path, f"line {line}", f"scores {row[0]} again", "Give each id once")
-            scores[key] = _number(path, line, "score", row[1])
-    except csv.Error as error:
-        raise InputError(path, f"line {before + rows.line_num}", str(error), _FIX) from None
-    return scores
+    for number, line in enumerate(text.splitlines() or [""], start=1):
+        if line.startswith("#") and not has_head:
+            if stated := _THRESHOLD.fullmatch(line):
+                threshold = _number(path, number, "threshold", stated[1])
+            continue
+        first, _, second = line.partition(",")
+        if not has_head:
+            if (first.strip(), second.strip()) != HEAD:
+                raise InputError(path, f"line {number}", f"is not {','.join(HEAD)}", _FIX)
+            has_head = True
+            continue
+        if not _ID.fullmatch(first):
+            problem = "is not an id of 32 hexadecimal digits and a score"
+            raise InputError(path, f"line {number}", problem, _FIX)
+        if (key := bytes.fromhex(first)) in scores:
+            raise InputError(path, f"line {number}", f"scores {first} again", "Give each id once")
+        scores[key] = score = _number(path, number, "score", second)
+        if threshold is None and not 0 <= score <= 1:
+            problem = f"{score:g} is no probability, and no threshold is stated"
+            fix = "Begin the file with a line: # threshold: NUMBER"
+            raise InputError(path, f"line {number}", problem, fix)
+    return ScoreFile(path.stem, str(path), 0.5 if threshold is None else threshold, threshold is None, scores)
 
 
 def _number(path: Path, line: int, what: str, text: str) -> float:

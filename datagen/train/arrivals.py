@@ -7,7 +7,6 @@ yaw_goal_tolerance 0.25 rad by default
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from dataclasses import dataclass
@@ -100,39 +99,30 @@ def read_arrival(given: str) -> Arrival:
     return normal_arrival(size_m, yaw_rad) if kind == "normal" else disc_arrival(size_m, yaw_rad)
 
 
-def arrival_of(arrival: str | None, arrival_std: str | None) -> Arrival | None:
-    """The arrival error of the options --arrival and --arrival-std; None without them."""
-    if arrival is not None and arrival_std is not None:
-        raise InputError("--arrival-std", arrival_std[:60], "is given with --arrival", "Give one of the two")
-    if arrival_std is not None:
-        return read_arrival(f"normal:{arrival_std}")
-    return None if arrival is None else read_arrival(arrival)
-
-
 def _read_samples(path: Path) -> Arrival:
     if not path.is_file():
         raise InputError("--arrival", str(path)[:60], "is neither a distribution nor a file", _FIX)
     text = read_regular(path, _MOST_BYTES, _FIX).decode("utf-8", errors="replace")
-    lines = list(csv.reader(line for line in text.splitlines() if line.strip() and not line.startswith("#")))
-    names = [name.strip() for name in lines[0]] if lines else []
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    names = [name.strip() for name in lines[0].split(",")] if lines else []
     fix = "Give a header x_m,y_m,yaw_rad and one arrival a line: ahead of and left of the goal, and its turn"
     if names not in (["x_m", "y_m"], ["x_m", "y_m", "yaw_rad"]):
         raise InputError(path, "header", f"is {','.join(names)[:60]!r}", fix)
     if not _LEAST_ROWS <= len(lines) - 1 <= _MOST_ROWS:
         problem = f"are {len(lines) - 1}, not {_LEAST_ROWS} to {_MOST_ROWS:,}"
         raise InputError(path, "arrivals", problem, "Record more arrivals, or cut the file")
-    rows = list[list[float]]()
-    for k, line in enumerate(lines[1:], start=2):
-        try:
-            row = [float(cell) for cell in line]
-        except ValueError:
-            row = []
-        sound = len(row) == len(names) and all(math.isfinite(value) for value in row)
-        if not sound or math.hypot(*row[:2]) > _LARGEST_M or abs(row[-1]) > math.pi:
-            problem = f"is not {len(names)} numbers within {_LARGEST_M:g} m and half a turn"
-            raise InputError(path, f"row {k}", problem, fix)
-        rows.append([*row, 0.0][:3])
-    samples = np.array(rows)[np.linspace(0, len(rows) - 1, min(len(rows), _USED_ROWS)).astype(np.int64)]
+    try:
+        rows = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
+    except ValueError as error:
+        raise InputError(path, "arrivals", str(error)[:200], fix) from None
+    if rows.shape[1] != len(names):
+        raise InputError(path, "arrivals", f"have {rows.shape[1]} columns, not {len(names)}", fix)
+    rows = np.column_stack([rows, np.zeros(len(rows))])[:, :3]
+    bad = ~(np.hypot(rows[:, 0], rows[:, 1]) <= _LARGEST_M) | ~(np.abs(rows[:, 2]) <= np.pi)
+    if bad.any():
+        problem = f"is not within {_LARGEST_M:g} m and half a turn"
+        raise InputError(path, f"arrival {int(bad.argmax()) + 1}", problem, fix)
+    samples = rows[np.linspace(0, len(rows) - 1, min(len(rows), _USED_ROWS)).astype(np.int64)]
     return Arrival(f"{len(rows):,} arrivals of {path.name}", samples, False)
 
 

@@ -108,7 +108,7 @@ def test_a_frame_without_a_checkpoint_is_scored_by_the_released_model(
 def test_it_has_its_own_name_beside_other_models(tmp_path: Path) -> None:
     write_untrained(tmp_path / "other.ckpt", MODEL)
     found = open_models([str(released.released_checkpoint()), str(tmp_path / "other.ckpt")])
-    assert [method.name for method in found] == ["released", "stage1"]
+    assert [method.name for method in found] == ["released", "other"]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import pytest
 from datagen.schemas.errors import InputError
 from datagen.train.arrivals import (
     Arrival,
-    arrival_of,
     disc_arrival,
     expected_success,
     normal_arrival,
@@ -38,8 +37,7 @@ def test_texts() -> None:
         read_arrival("normal:0.05,3deg").offsets, normal_arrival(0.05, math.radians(3)).offsets
     )
     np.testing.assert_array_equal(read_arrival("nav2").offsets, disc_arrival(0.25, 0.25).offsets)
-    given = arrival_of(None, "0.05")
-    assert given is not None and given.text == "normal, 0.05 m" and arrival_of(None, None) is None
+    assert read_arrival("normal:0.05").text == "normal, 0.05 m"
 
 
 def test_smoothing_a_plane_keeps_it_and_an_edge_halves() -> None:
@@ -88,9 +86,9 @@ def test_what_is_no_distribution_is_refused(text: str) -> None:
     [
         ("a,b\n1,2\n", "header"),
         ("x_m,y_m\n0,0\n", "arrivals: are 1"),
-        ("x_m,y_m\n" + "0,0\n" * 10 + "0,far\n", "row 12"),
-        ("x_m,y_m,yaw_rad\n" + "0,0,0\n" * 10 + "0,0,9\n", "row 12"),
-        ("x_m,y_m\n" + "0,0\n" * 10 + "0,nan\n", "row 12"),
+        ("x_m,y_m\n" + "0,0\n" * 10 + "0,far\n", "could not convert string 'far'"),
+        ("x_m,y_m,yaw_rad\n" + "0,0,0\n" * 10 + "0,0,9\n", "arrival 11"),
+        ("x_m,y_m\n" + "0,0\n" * 10 + "0,nan\n", "arrival 11"),
         ("", "header"),
     ],
 )
