@@ -21,8 +21,8 @@ pytestmark = pytest.mark.slow
 
 # Small runs in the command's own process: starting Ray eight times would cost more than the labels.
 SMALL = {
-    "--n 600 ": "--n 60 --workers 0 ",
-    "--n 6000": "--n 120 --seed 2 --workers 0",
+    "--n 6000 --out": "--n 60 --workers 0 --out",
+    "--n 6000 --houses": "--n 120 --seed 2 --workers 0 --houses",
     "datagen resume": "datagen resume --workers 0",
     "--replay 4": "--replay 2",
     # The commands are what is tried here, on every machine; real houses and objects have tests of their own.
