@@ -119,7 +119,7 @@ def merge_report(planned: MergePlan, result: MergeResult) -> dict[str, Any]:
         "labels": label_counts(parts).labels,
         "n": label_counts(parts).n,
         "sealed": result.sealed,
-        "total_wall_s": spending.total_wall_s,
+        "total_wall_s": spending.useful.wall_s + spending.wasted.wall_s,
         "useful_wall_s": spending.useful.wall_s,
         "runs": [_part(run, done.get(run.storage.url)) for run in parts],
     }

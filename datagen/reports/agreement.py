@@ -1,255 +1,116 @@
-"""Labels of runs as arrays, their agreement for the same candidates, and statistics of outcomes."""
+"""Labels of runs as arrays, and how far runs agree on the same candidates."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from datagen.reports.error_map import error_map
-from datagen.reports.scene_intervals import codes_of, estimates_by_group
-from datagen.reports.target_frame import SIDES, in_edge_frame, side_of, towards_nearest_edge
+from datagen.reports.specification_summary import is_disturbed
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
-from datagen.schemas.shard_reading import Array, read_committed
-from datagen.workers.bases.candidate_sets import (
-    DISTANCE_EDGES_M,
-    TENTHS,
-    VISIBILITY_EDGES,
-    Bools,
-    Edges,
-    Floats,
-    bands,
-    in_set,
+from datagen.schemas.shard_reading import read_committed
+from datagen.schemas.specification import Specification
+from datagen.train.evaluation.bootstrap import Estimate
+from datagen.workers.bases.candidate_sets import Bools, in_set
+
+# In ascending fidelity: the later of two is the reference for the earlier.
+_FIDELITY = ("heuristic", "plan", "sim")
+_RESAMPLES = 1000
+_COLUMNS = (
+    *("sample_scene_index", "candidate_index", "label", "base_is_clear", "mount_distance_m", "arm_reach_m"),
 )
-
-Rows = npt.NDArray[np.intp]
-
-REACH_EDGES_M: Edges = (0.0, *TENTHS[3:], None)
-HEIGHT_EDGES_M: Edges = (0.0, *TENTHS[5:], None)
-# Edges of the distance from the arm's mount to the target, in reaches of the arm.
-OVER_REACH_EDGES: Edges = (0.0, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, None)
-
-_COLUMNS = {
-    "sample_scene_index": "scene",
-    "candidate_index": "candidate",
-    "label": "label",
-    "base_is_clear": "is_clear",
-    "distance_m": "distance_m",
-    "mount_distance_m": "mount_distance_m",
-    "visibility": "visibility",
-    "arm_reach_m": "reach_m",
-    "base_height_m": "height_m",
-}
-_SCENE_COLUMNS = ("object_name", "support_type", "T_world_support", "support_size_m", "target_center_m")
 
 
 @dataclass(frozen=True, eq=False)
-class Labelled:
-    """N candidates with a label and the quantities to group them by. Arrays are (N,)."""
+class Labels:
+    """All committed candidates of a run, also beyond its n. Arrays are (N,)."""
 
+    run: Run
     scene: npt.NDArray[np.int64]
-    candidate: npt.NDArray[np.int32]
+    candidate: npt.NDArray[np.int64]
     label: Bools
-    is_clear: Bools
-    distance_m: Floats
-    mount_distance_m: Floats
-    visibility: Floats
-    reach_m: Floats
-    height_m: Floats
-    edge_xy_m: npt.NDArray[np.float64]  # (N, 2), base position in the frame of `target_frame.in_edge_frame`
-    target: npt.NDArray[Any]  # the object's name
-    furniture: npt.NDArray[Any]  # the type of the furniture that carries the target
+    within_reach: Bools  # the base is clear and the target within the arm's reach
     outcome: npt.NDArray[np.uint8] | None  # code of OUTCOMES; None where the label has no cause
 
-    def __len__(self) -> int:
-        return len(self.label)
-
-    def at(self, rows: Rows | Bools) -> Labelled:
-        """Some of the candidates."""
-        cut = {name: getattr(self, name)[rows] for name in ROWS}
-        return Labelled(**cut, outcome=None if self.outcome is None else self.outcome[rows])
-
-    def is_in(self, candidates: str) -> Bools:
-        """Mask (N,) of the candidates in a set of CANDIDATE_SETS."""
-        return in_set(candidates, self.is_clear, self.mount_distance_m, self.reach_m)
+    def outcomes(self) -> dict[str, int]:
+        """Candidates within reach by outcome, the most frequent first."""
+        if self.outcome is None:
+            return {}
+        counts = np.bincount(self.outcome[self.within_reach], minlength=len(OUTCOMES)).tolist()
+        found = {name: count for name, count in zip(OUTCOMES, counts, strict=True) if count}
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 
-# The arrays that every label source has.
-ROWS = tuple(f.name for f in fields(Labelled) if f.name != "outcome")
-
-
-def common_candidates(a: Labelled, b: Labelled) -> tuple[Labelled, Labelled]:
-    """The candidates that both labelled, by scene and index, in the same order."""
-    # A scene has fewer than 2^32 candidates.
-    keys = [side.scene * 2**32 + side.candidate for side in (a, b)]
-    _, rows_a, rows_b = np.intersect1d(*keys, assume_unique=True, return_indices=True)
-    return a.at(rows_a), b.at(rows_b)
-
-
-def confusion(predicted: Bools, true: Bools) -> dict[str, int]:
-    """Confusion counts of labels `predicted` (N,) and reference labels `true` (N,)."""
-    return {
-        "true_positive": int((predicted & true).sum()),
-        "false_positive": int((predicted & ~true).sum()),
-        "false_negative": int((~predicted & true).sum()),
-        "true_negative": int((~predicted & ~true).sum()),
-    }
-
-
-def agreement(predicted: Bools, true: Bools) -> dict[str, Any]:
-    """Counts, shares and accuracies; None where they are undefined.
-
-    Balanced accuracy is the mean of sensitivity and specificity: 0.5 for a constant rule, however rare
-    positives are.
-    """
-    n, positives = len(true), int(true.sum())
-    sensitivity = float(predicted[true].mean()) if positives else None
-    specificity = float((~predicted)[~true].mean()) if positives < n else None
-    return {
-        "count": n,
-        "said_positive": int(predicted.sum()),
-        "true_positive_share": positives / n if n else None,
-        "accuracy": float((predicted == true).mean()) if n else None,
-        "balanced_accuracy": (sensitivity + specificity) / 2
-        if sensitivity is not None and specificity is not None
-        else None,
-    }
-
-
-def compare(predicted: Labelled, true: Labelled) -> dict[str, Any]:
-    """Compare the labels of `predicted` with those of `true`, for the same candidates in the same order.
-
-    Intervals of 95% are by scene (`scene_intervals`). Groups are by quantities of `true`.
-    """
-
-    def by_code(group: npt.NDArray[np.integer[Any]], keys: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        estimates = estimates_by_group(predicted.label, true.label, true.scene, group, len(keys))
-        each = (group == g for g in range(len(keys)))
-        return [
-            key | agreement(predicted.label[rows], true.label[rows]) | estimate
-            for key, rows, estimate in zip(keys, each, estimates, strict=True)
-        ]
-
-    def by_band(values: Floats, edges: Edges) -> list[dict[str, Any]]:
-        group, keys = np.zeros(len(true), np.int64), list[dict[str, Any]]()
-        for low, high, rows in bands(values, edges):
-            group[rows] = len(keys)
-            keys.append({"low": low, "high": high})
-        return by_code(group, keys)
-
-    def by_name(key: str, values: npt.NDArray[Any]) -> list[dict[str, Any]]:
-        names, codes = codes_of(values)
-        return by_code(codes, [{key: name} for name in names])
-
-    over_reach = true.mount_distance_m / true.reach_m
-    sides = np.array(SIDES)[side_of(true.edge_xy_m)]
-    (whole,) = by_code(np.zeros(len(true), np.int64), [{}])
-    return {
-        **whole,
-        "confusion": confusion(predicted.label, true.label),
-        "by_distance": by_band(true.distance_m, DISTANCE_EDGES_M),
-        "by_distance_over_reach": by_band(over_reach, OVER_REACH_EDGES),
-        "by_visibility": by_band(true.visibility, VISIBILITY_EDGES),
-        "by_reach": by_band(true.reach_m, REACH_EDGES_M),
-        "by_height": by_band(true.height_m, HEIGHT_EDGES_M),
-        "by_object": by_name("object", true.target),
-        "by_furniture": by_name("furniture", true.furniture),
-        "by_side": by_name("side", sides),
-        "by_outcome": _by_outcome(predicted, true),
-        "error_map": error_map(predicted.label, true.label, true.edge_xy_m),
-    }
-
-
-def _by_outcome(predicted: Labelled, true: Labelled) -> list[dict[str, Any]]:
-    """For each outcome of `true`, its count, the predicted positives, and the accuracy with its interval."""
-    if true.outcome is None:
-        return []
-    codes, group = np.unique(true.outcome, return_inverse=True)
-    estimates = estimates_by_group(predicted.label, true.label, true.scene, group, len(codes))
-    names = tuple(OUTCOMES)
-    return [
-        {
-            "outcome": names[code],
-            "count": estimate["count"],
-            "said_positive": int(predicted.label[group == g].sum()),
-            **{key: estimate[key] for key in ("scenes", "accuracy", "accuracy_interval")},
-        }
-        for g, (code, estimate) in enumerate(zip(codes.tolist(), estimates, strict=True))
-    ]
-
-
-def outcome_report(labelled: Labelled) -> dict[str, Any]:
-    """Return outcomes and deciding stages with count and share, and the share of positives by band."""
-    assert labelled.outcome is not None
-    n = len(labelled)
-    counts = np.bincount(labelled.outcome, minlength=len(OUTCOMES))
-    outcomes: list[dict[str, Any]] = [
-        {"outcome": name, "stage": OUTCOMES[name], "count": int(count), "share": int(count) / n}
-        for name, count in zip(OUTCOMES, counts, strict=True)
-        if count
-    ]
-    # Failures by the stage that decided them.
-    stages = dict.fromkeys(OUTCOMES.values(), 0)
-    for row in outcomes:
-        if row["outcome"] != "success":
-            stages[row["stage"]] += row["count"]
-
-    def share_by(values: Floats, edges: Edges) -> list[dict[str, Any]]:
-        return [
-            {"low": low, "high": high, "count": int(rows.sum()), "positive": int(labelled.label[rows].sum())}
-            for low, high, rows in bands(values, edges)
-        ]
-
-    return {
-        "count": n,
-        "outcomes": outcomes,
-        "failures_by_stage": [
-            {"stage": s, "count": count, "share": count / n} for s, count in stages.items() if count
-        ],
-        "positive_by": {
-            "distance": share_by(labelled.distance_m, DISTANCE_EDGES_M),
-            "reach": share_by(labelled.reach_m, REACH_EDGES_M),
-            "height": share_by(labelled.height_m, HEIGHT_EDGES_M),
-        },
-    }
-
-
-def read_labelled(run: Run) -> Labelled | None:
-    """All committed candidates of a run, also beyond n; None without any. InputError for a damaged file."""
-    has_outcome = any(f.name == "outcome" for f in run.schema.sample_fields)
-    names = [*_COLUMNS, *_SCENE_COLUMNS, "base_xy_m", *(["outcome"] if has_outcome else [])]
+def read_labels(run: Run) -> Labels:
+    """Read the labels of a run. InputError for a damaged file."""
+    has_outcome = any(field.name == "outcome" for field in run.schema.sample_fields)
+    names = [*_COLUMNS, *(["outcome"] if has_outcome else [])]
     shards = [read_committed(run.storage, run.commit_of(shard), names) for shard in sorted(run.committed())]
-    if not shards:
-        return None
-    per_scene = run.layout.candidates_per_scene
 
-    def joined(parts: Iterable[Array]) -> Any:
-        return np.concatenate(list(parts))
+    def joined(name: str) -> Any:
+        return np.concatenate([np.zeros(0, np.uint8), *(shard[name] for shard in shards)])
 
-    columns = {to: joined(shard[name] for shard in shards) for name, to in _COLUMNS.items()}
-    columns["label"] = columns["label"].astype(np.bool_)
-    return Labelled(
-        **columns,
-        edge_xy_m=joined(_edge_xy_m(shard, per_scene) for shard in shards),
-        target=joined(np.repeat(shard["object_name"][:, 0], per_scene) for shard in shards),
-        furniture=joined(np.repeat(shard["support_type"], per_scene) for shard in shards),
-        outcome=joined(shard["outcome"] for shard in shards) if has_outcome else None,
+    clear, near = joined("base_is_clear") == 1, (joined("mount_distance_m"), joined("arm_reach_m"))
+    return Labels(
+        run=run,
+        scene=joined("sample_scene_index").astype(np.int64),
+        candidate=joined("candidate_index").astype(np.int64),
+        label=joined("label") == 1,
+        within_reach=in_set("in-range", clear, *near),
+        outcome=joined("outcome") if has_outcome else None,
     )
 
 
-def _edge_xy_m(shard: dict[str, Array], per_scene: int) -> Array:
-    center_m = shard["target_center_m"]
-    towards = towards_nearest_edge(shard["T_world_support"], shard["support_size_m"], center_m)
-    each = (np.repeat(values, per_scene, axis=0) for values in (center_m[:, :2], towards))
-    return in_edge_frame(shard["base_xy_m"], *each)
+def fidelity(spec: Specification) -> tuple[int, bool]:
+    """Rank of a specification's labels: heuristic, plan, sim, disturbed sim."""
+    known = spec.label_source in _FIDELITY
+    return (_FIDELITY.index(spec.label_source) if known else 0, is_disturbed(spec))
 
 
-def join_labelled(parts: list[Labelled]) -> Labelled:
-    """Join candidates of several runs of one schema."""
-    rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ROWS}
-    outcomes = [part.outcome for part in parts if part.outcome is not None]
-    return Labelled(**rows, outcome=np.concatenate(outcomes) if outcomes else None)
+def agreements(runs: Sequence[Labels]) -> list[dict[str, Any]]:
+    """The share of equal labels of every two runs over the same candidates, within reach.
+
+    `runs` are in ascending fidelity; the later of two is the reference.
+    """
+    found: list[dict[str, Any]] = []
+    for first, second in combinations(runs, 2):
+        specs = first.run.manifest.spec, second.run.manifest.spec
+        if specs[0].scenes_hash == specs[1].scenes_hash and specs[0] != specs[1]:
+            runs_of = {"run": first.run.storage.url, "reference_run": second.run.storage.url}
+            names = {"labels": _name(specs[0]), "reference": _name(specs[1])}
+            found.append(runs_of | names | equal_share(first, second))
+    return found
+
+
+def _name(spec: Specification) -> str:
+    return f"{spec.label_source} disturbed" if is_disturbed(spec) else spec.label_source
+
+
+def equal_share(first: Labels, second: Labels) -> dict[str, Any]:
+    """Count and share of equal labels of the candidates within reach that both have, with its interval.
+
+    The interval is that of 1,000 resamples of scenes, since candidates of a scene are correlated.
+    """
+    # A scene has fewer than 2^32 candidates.
+    keys = [side.scene * 2**32 + side.candidate for side in (first, second)]
+    _, a, b = np.intersect1d(*keys, assume_unique=True, return_indices=True)
+    near = second.within_reach[b]
+    a, b = a[near], b[near]
+    both = first.label[a] + 2 * second.label[b].astype(np.int64)
+    neither, only_first, only_reference, good = np.bincount(both, minlength=4).tolist()
+    counts = {"both": good, "neither": neither, "only_first": only_first, "only_reference": only_reference}
+    if not len(a):
+        return {"candidates": 0, "scenes": 0, "counts": counts, "equal_share": None, "interval": None}
+    _, row = np.unique(second.scene[b], return_inverse=True)
+    equal, of = np.bincount(row, first.label[a] == second.label[b]), np.bincount(row)
+    rng, n = np.random.default_rng(0), len(of)
+    drawn = (rng.integers(0, n, n) for _ in range(_RESAMPLES))
+    resamples = np.array([equal[scenes].sum() / of[scenes].sum() for scenes in drawn])
+    share = float(equal.sum() / len(a))
+    interval = list(Estimate(share, resamples, n).interval()) if n > 1 else None
+    return {"candidates": len(a), "scenes": n, "counts": counts, "equal_share": share, "interval": interval}

@@ -1,93 +1,138 @@
-"""The audit of runs as plain values: cost, waste, sums, and agreement."""
+"""The audit of runs as plain values: what was made, its cost, the waste, and the cost of the paper's labels.
+
+CPU seconds are measured for a shard, not for a candidate. The whole cost of a run, waste included, is divided
+by the number of labels of a kind: candidates whose base collides or that are beyond reach cost almost nothing
+and say almost nothing, so labels within reach carry the whole cost.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import combinations
+from collections.abc import Iterable, Mapping, Sequence
+from math import fsum
 from typing import Any
 
-from datagen.reports.agreement import join_labelled, outcome_report, read_labelled
-from datagen.reports.label_costs import PAPER_LABELS, audit_report, costs_of_runs, paper_costs, source_costs
-from datagen.reports.ledger_balance import Balance, balance
-from datagen.reports.paired_runs import AuditedRun, correct_labels, fidelity, pairs
-from datagen.reports.prices import Prices
-from datagen.reports.scene_intervals import METHOD
-from datagen.reports.spending import account_for
+from datagen.reports.agreement import Labels, agreements, fidelity, read_labels
+from datagen.reports.spending import Account, Spending, account_for
+from datagen.schemas.cost import STAGES
 from datagen.schemas.run import Run
 
+# GBPP: 180,000 distance-visibility labels in under three days on one RTX A5000, and over three weeks
+# for as many simulated ones.
+PAPER_LABELS = 180_000
+PAPER_DAYS = {"heuristic": 3.0, "sim": 21.0}
+_DAY_S = 86400.0
+_SCENE_STAGES = ("draw", "settle", "observe")
 
-def audit_runs(runs: Sequence[Run], candidates: str, prices: Prices) -> dict[str, Any]:
-    """Return the audit of runs; times in seconds, sizes in bytes, money in the currency of the prices.
 
-    `candidates` is a set of CANDIDATE_SETS, for outcomes and agreement. Runs are ordered by fidelity. Raises
-    InputError for a damaged record or shard.
+def audit_runs(runs: Sequence[Run]) -> dict[str, Any]:
+    """Return the audit of runs by label source, in ascending fidelity; times in core seconds, sizes in bytes.
+
+    `is_exact` is False where a ledger does not add up to commits and waste. InputError for a damaged record
+    or shard.
     """
-    ordered = sorted(runs, key=lambda run: fidelity(run.manifest.spec))
-    spendings = [account_for([run]) for run in ordered]
-    audited = [
-        AuditedRun(run, read_labelled(run), cost, spending.wall_s_per_label)
-        for run, cost, spending in zip(ordered, costs_of_runs(ordered, spendings), spendings, strict=True)
-    ]
-    by_source: dict[str, list[AuditedRun]] = {}
-    for one in audited:
-        by_source.setdefault(one.run.manifest.spec.label_source, []).append(one)
-    sources = [_source(source, group, candidates, prices) for source, group in by_source.items()]
+    labels = [read_labels(run) for run in sorted(runs, key=lambda run: fidelity(run.manifest.spec))]
+    by_source: dict[str, list[Labels]] = {}
+    for each in labels:
+        by_source.setdefault(each.run.manifest.spec.label_source, []).append(each)
+    spent = {source: account_for(each.run for each in group) for source, group in by_source.items()}
+    differences = {clock: fsum(s.difference_s[clock] for s in spent.values()) for clock in ("wall", "cpu")}
+    contradictions = sum(spending.contradictions for spending in spent.values())
     return {
-        "candidates": candidates,
-        "intervals": METHOD,
-        "prices": prices.record(),
-        "balance": balance_record(balance(ordered)),
-        "sources": sources,
-        "ratios": ratios(sources),
-        "paper": {"labels": PAPER_LABELS, "by_source": paper_costs(prices)},
-        "correct_labels": correct_labels(audited, prices),
-        "pairs": pairs(audited, candidates),
-    }
-
-
-def _source(source: str, group: Sequence[AuditedRun], candidates: str, prices: Prices) -> dict[str, Any]:
-    """Sums, costs and outcomes of the runs of one label source."""
-    spending = account_for(one.run for one in group)
-    read = [one.labelled for one in group if one.labelled is not None]
-    labelled = join_labelled(read) if read else None
-    report = audit_report(spending, source, prices)
-    report |= source_costs(spending, [one.cost for one in group], labelled, prices)
-    report["made_from"] = "; ".join(dict.fromkeys(one.run.manifest.made_from for one in group))
-    if labelled is not None and labelled.outcome is not None:
-        report["outcomes"] = outcome_report(labelled.at(labelled.is_in(candidates)))
-    return report
-
-
-def ratios(sources: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return, for every two label sources, the cost of a label of the second divided by that of the first.
-
-    For any label in worker time, without borrowed scenes; for one within reach in core time, with them.
-    """
-    found: list[dict[str, Any]] = []
-    for first, second in combinations(sources, 2):
-        if not (first["wall_s_per_label"] and second["wall_s_per_label"]):
-            continue
-        near = [source["cost_per"]["label_within_reach"] for source in (first, second)]
-        found.append(
-            {
-                "source": second["label_source"],
-                "over": first["label_source"],
-                "cost_ratio": second["wall_s_per_label"] / first["wall_s_per_label"],
-                "cost_ratio_within_reach": near[1]["core_s"] / near[0]["core_s"]
-                if all(near) and near[0]["core_s"]
-                else None,
-            }
-        )
-    return found
-
-
-def balance_record(sums: Balance) -> dict[str, Any]:
-    """The sums of ledgers as plain values, with the findings of records that differ."""
-    return {
-        "exact": sums.is_exact,
-        **{name: getattr(sums, name) for name in ("ledger_s", "commits_s", "waste_s", "difference_s")},
-        "findings": [
-            {"file": f.key, "kind": f.kind, "problem": f.problem, "fix": f.fix, "shard": f.shard}
-            for f in sums.findings
+        "is_exact": not contradictions and not any(differences.values()),
+        "contradictions": contradictions,
+        "difference_s": differences,
+        "sources": [
+            _source(source, group, spent[source], _scenes_s(group, runs))
+            for source, group in by_source.items()
         ],
+        "agreement": agreements(labels),
     }
+
+
+def _source(
+    source: str, labels: Sequence[Labels], spending: Spending, scenes_s: float | None
+) -> dict[str, Any]:
+    """The record of the runs of one label source; `scenes_s` is that of `_scenes_s`."""
+    useful, wasted = spending.useful, spending.wasted
+    near = sum(int(each.within_reach.sum()) for each in labels)
+    near_positive = sum(int((each.within_reach & each.label).sum()) for each in labels)
+    stages = {stage: useful.stage_s[stage] for stage in STAGES if stage in useful.stage_s}
+    cost = {
+        **stages,
+        "other": useful.core_s - fsum(stages.values()),
+        "waste": wasted.core_s,
+        "scenes of other runs": scenes_s or 0.0,
+        "relabelled files": useful.relabelled_s,
+    }
+    total = fsum(cost.values())
+    counts = {
+        "label": spending.labels,
+        "label_within_reach": near,
+        "positive": spending.positives,
+        "positive_within_reach": near_positive,
+        "scene": spending.scenes,
+    }
+    per = {name: total / count if count else None for name, count in counts.items()}
+    return {
+        "label_source": source,
+        "made_from": "; ".join(dict.fromkeys(each.run.manifest.made_from for each in labels)),
+        "counts": counts,
+        "outcomes_within_reach": _summed(each.outcomes() for each in labels),
+        "core_s": cost,
+        "total_core_s": total,
+        "includes_scenes": scenes_s is not None,
+        "wall_s": useful.wall_s + wasted.wall_s,
+        "core_s_per": per,
+        "attempts": useful.attempts + wasted.attempts,
+        "waste": {kind: _plain(account) for kind, account in sorted(spending.waste.items())},
+        "causes": {
+            cause: _plain(account)
+            for cause, account in sorted(spending.causes.items(), key=lambda item: -item[1].core_s)
+        },
+        "rejected_scenes": dict(sorted(spending.rejected.items())),
+        "stored_bytes": useful.written_bytes,
+        "peak_rss_bytes": useful.peak_rss_bytes,
+        "machines": dict(spending.machines),
+        "projection": _projection(source, per, useful.written_bytes, spending.labels),
+    }
+
+
+def _scenes_s(group: Sequence[Labels], runs: Sequence[Run]) -> float | None:
+    """Core seconds of the scenes that others of the runs made for these; None where no run made them."""
+    total = 0.0
+    for run in (each.run for each in group if each.run.manifest.spec.scenes_from):
+        spending = account_for([run])
+        if spending.useful.relabelled_s:
+            continue  # its cost includes the scenes
+        made_by = [other for other in runs if other.manifest.spec_hash == run.manifest.spec.scenes_hash]
+        if not made_by:
+            return None
+        maker = account_for(made_by[:1])
+        made_s = fsum(maker.useful.stage_s[stage] for stage in _SCENE_STAGES)
+        total += made_s * spending.scenes / maker.scenes if maker.scenes else 0.0
+    return total
+
+
+def _projection(source: str, per: Mapping[str, float | None], stored: int, labels: int) -> dict[str, Any]:
+    def days(each_s: float | None) -> float | None:
+        return None if each_s is None else each_s * PAPER_LABELS / _DAY_S
+
+    return {
+        "labels": PAPER_LABELS,
+        "core_days": days(per["label"]),
+        "core_days_within_reach": days(per["label_within_reach"]),
+        "bytes": stored * PAPER_LABELS / labels if labels else None,
+        "paper_gpu_days": PAPER_DAYS.get(source),
+    }
+
+
+def _plain(account: Account) -> dict[str, Any]:
+    return {name: getattr(account, name) for name in ("attempts", "unknown", "wall_s", "core_s")}
+
+
+def _summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    total: dict[str, int] = {}
+    for each in counts:
+        for name, count in each.items():
+            total[name] = total.get(name, 0) + count
+    return total

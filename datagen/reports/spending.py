@@ -18,14 +18,11 @@ class Account:
     """Sums over attempts; seconds and bytes."""
 
     attempts: int = 0
-    without_account: int = 0  # attempts without a recorded cost
+    unknown: int = 0  # attempts without a recorded cost
     wall_s: float = 0.0
-    cpu_s: float = 0.0
-    unmeasured_cpu_s: float = 0.0  # wall seconds of killed attempts, whose CPU time was lost with the process
-    gpu_s: float | None = None  # None where no record has GPU seconds
-    stage_wall_s: Counter[str] = field(default_factory=Counter)
-    stage_cpu_s: Counter[str] = field(default_factory=Counter)
-    source_s: Counter[str] = field(default_factory=Counter)  # "wall" and "cpu": cost of relabelled files
+    core_s: float = 0.0  # CPU seconds; wall seconds of killed attempts, whose CPU time was lost with them
+    stage_s: Counter[str] = field(default_factory=Counter)  # CPU seconds by stage
+    relabelled_s: float = 0.0  # CPU seconds that another run spent on relabelled files
     written_bytes: int = 0
     peak_rss_bytes: int = 0
 
@@ -33,85 +30,79 @@ class Account:
         """Add one attempt."""
         self.attempts += 1
         if cost is None:
-            self.without_account += 1
+            self.unknown += 1
             return
         self.wall_s += cost.wall_s
-        self.cpu_s += cost.cpu_s
-        if not cost.cpu_s:
-            self.unmeasured_cpu_s += cost.wall_s
-        if cost.stage_gpu_s:
-            self.gpu_s = (self.gpu_s or 0.0) + fsum(cost.stage_gpu_s.values())
-        self.stage_wall_s.update(cost.stage_wall_s)
-        self.stage_cpu_s.update(cost.stage_cpu_s)
-        self.source_s.update(cost.source_s)
+        self.core_s += cost.cpu_s or cost.wall_s
+        self.stage_s.update(cost.stage_cpu_s)
+        self.relabelled_s += cost.source_s.get("cpu", 0.0)
         self.written_bytes += cost.written_bytes
         self.peak_rss_bytes = max(self.peak_rss_bytes, cost.peak_rss_bytes)
-
-    @property
-    def unnamed_wall_s(self) -> float:
-        """Wall seconds that no stage claimed."""
-        return max(0.0, self.wall_s - fsum(self.stage_wall_s.values()))
-
-    @property
-    def unnamed_cpu_s(self) -> float:
-        """CPU seconds that no stage claimed."""
-        return max(0.0, self.cpu_s - fsum(self.stage_cpu_s.values()))
-
-    @property
-    def core_s(self) -> float:
-        """Seconds of a core to pay for: CPU seconds, and wall seconds of killed attempts."""
-        return self.cpu_s + self.unmeasured_cpu_s
 
 
 @dataclass
 class Spending:
-    """The cost of a set of runs, split into committed attempts and waste."""
+    """The cost of a set of runs: each attempt of the ledgers is either committed or waste."""
 
     labels: int = 0
     positives: int = 0
     scenes: int = 0
-    redraws: Counter[str] = field(default_factory=Counter)
+    rejected: Counter[str] = field(default_factory=Counter)  # tries of scenes, by cause
     useful: Account = field(default_factory=Account)
     # By outcome; attempts at shards that are quarantined now are under QUARANTINED, whatever their outcome.
     waste: dict[str, Account] = field(default_factory=dict)
-    causes: dict[tuple[str, str], Account] = field(default_factory=dict)  # waste by (outcome, cause)
-    running: int = 0  # attempts that began and have not ended
+    causes: dict[str, Account] = field(default_factory=dict)  # of failed attempts
     machines: Counter[str] = field(default_factory=Counter)  # attempts by processor
+    # Ledger minus commits minus waste; exactly 0 where every record agrees with its commit.
+    difference_s: dict[str, float] = field(default_factory=lambda: {"wall": 0.0, "cpu": 0.0})
+    contradictions: int = 0  # records of the ledger that do not fit the commits
 
     @property
-    def wall_s_per_label(self) -> float | None:
-        """Worker seconds per label, waste and relabelled files included."""
-        return (self.total_wall_s + self.useful.source_s["wall"]) / self.labels if self.labels else None
-
-    @property
-    def total_wall_s(self) -> float:
-        """Worker seconds of these runs themselves."""
-        return self.useful.wall_s + sum(a.wall_s for a in self.waste.values())
+    def wasted(self) -> Account:
+        """The sum of the waste."""
+        return Account(
+            attempts=sum(each.attempts for each in self.waste.values()),
+            unknown=sum(each.unknown for each in self.waste.values()),
+            wall_s=fsum(each.wall_s for each in self.waste.values()),
+            core_s=fsum(each.core_s for each in self.waste.values()),
+        )
 
 
 def account_for(runs: Iterable[Run]) -> Spending:
     """Add up commits and ledgers. A committed attempt is counted once, from its commit.
 
-    The other entries of the ledger are waste by their outcome: ledger = commits + waste. An attempt with a
-    commit but without a ledger entry (the driver died between the two) counts as useful.
+    The other entries of the ledger are waste by their outcome: ledger = commits + waste.
     """
     spending = Spending()
     for run in runs:
-        # Before the commits: every attempt that the ledger calls committed then has its commit.
-        ends, unfinished = list(run.ledger.ends()), run.ledger.unfinished()
-        committed, quarantined = set[str](), run.quarantined()
+        # The ledger before the commits: then an attempt that it calls committed has its commit.
+        ends = {end.attempt: end for end in run.ledger.ends()}
+        committed, shards, quarantined = set[str](), set[int](), run.quarantined()
+        balance = [(1, end.cost) for end in ends.values()]  # each cost once with each sign
         for commit in run.commits():
             committed.add(commit.attempt)
+            shards.add(commit.shard)
             spending.labels += commit.samples
             spending.positives += commit.positives
             spending.scenes += commit.scenes
-            spending.redraws.update(commit.redraws)
+            spending.rejected.update(commit.redraws)
             spending.useful.add(commit.cost)
             spending.machines[f"{commit.host.cpu}, {commit.host.cores} cores"] += 1
-        for entry in ends:
-            if entry.attempt not in committed:
-                kind = QUARANTINED if entry.shard in quarantined else entry.outcome
-                spending.waste.setdefault(kind, Account()).add(entry.cost)
-                spending.causes.setdefault((entry.outcome, entry.cause), Account()).add(entry.cost)
-        spending.running += sum(start.attempt not in committed for start in unfinished)
+            end = ends.get(commit.attempt)
+            if end is None and (end := run.ledger.end_of(commit.attempt)):  # written since
+                balance.append((1, end.cost))
+            balance.append((-1, commit.cost))
+            found = None if end is None else (end.shard, end.outcome, end.cost)
+            spending.contradictions += found != (commit.shard, "committed", commit.cost)
+        for end in ends.values():
+            if end.attempt not in committed:
+                kind = QUARANTINED if end.shard in quarantined else end.outcome
+                spending.waste.setdefault(kind, Account()).add(end.cost)
+                if end.cause:
+                    spending.causes.setdefault(end.cause, Account()).add(end.cost)
+                balance.append((-1, end.cost))
+                spending.contradictions += end.outcome == "committed" and end.shard not in shards
+        known = [(sign, cost) for sign, cost in balance if cost]
+        spending.difference_s["wall"] += fsum(sign * cost.wall_s for sign, cost in known)
+        spending.difference_s["cpu"] += fsum(sign * cost.cpu_s for sign, cost in known)
     return spending

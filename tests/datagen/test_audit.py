@@ -1,81 +1,104 @@
-"""`datagen audit`: its files, its refusals, and what a person reads first."""
+"""`datagen audit`: what is divided by what, on runs whose costs are set by hand, and what a person reads."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from xml.etree import ElementTree
+from typing import Any
 
+import numpy as np
 import pytest
-from PIL import Image
 
 from datagen import cli
-from datagen.reports.prices import DEFAULT_PRICES
+from datagen.reports.audit import PAPER_LABELS, audit_runs
 from datagen.schemas.run import Run
+from datagen.schemas.run_records import Cost, LedgerEntry
 from datagen.schemas.specification import ScenesFrom
-from tests.made_runs import make_run, small_spec
-from tests.refusals import refused
-from tests.small_runs import json_of
+from tests.made_runs import make_run, rows_of, small_spec
+
+STAGES = {"draw": 0.2, "settle": 0.1, "observe": 0.1, "visibility": 0.5}
 
 
-@pytest.fixture(scope="module")
-def paired(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """Two runs with labels of the same candidates. Tests only read them."""
-    folder = tmp_path_factory.mktemp("paired")
-    first = make_run(folder / "first", n=200)
-    scenes = ScenesFrom(spec_hash=first.manifest.spec_hash)
-    second = make_run(folder / "second", n=200, spec=small_spec(seed=1, scenes_from=scenes))
-    return [first.storage.url, second.storage.url]
+@pytest.fixture
+def priced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every attempt that `make_run` makes takes 1 s of wall and CPU time, of which these stages have 0.9."""
+
+    def cost(**_: Any) -> Cost:
+        return Cost(wall_s=1, cpu_s=1, stage_wall_s=STAGES, stage_cpu_s=STAGES, written_bytes=10**6)
+
+    monkeypatch.setattr("tests.made_runs.Cost", cost)
 
 
-@pytest.mark.parametrize("name", ["map.png", "map.svg"])
-def test_a_map_of_wrong_labels_is_drawn(
-    name: str, paired: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / name
-    assert cli.run(["audit", *paired, "--map", str(out)]) == 0
-    assert str(out) in capsys.readouterr().out
-    if name.endswith("png"):
-        with Image.open(out) as image:
-            assert image.width > 1000 and image.height > 300
-    else:
-        assert ElementTree.parse(out).getroot().tag.endswith("svg")
-    again = tmp_path / f"again-{name}"
-    assert cli.run(["audit", *paired, "--map", str(again)]) == 0
-    assert again.read_bytes() == out.read_bytes()
+def relabelled(folder: Path, maker: Run, n: int, seed: int = 0) -> Run:
+    scenes = ScenesFrom(spec_hash=maker.manifest.spec_hash)
+    return make_run(folder, n=n, spec=small_spec(seed=seed, scenes_from=scenes))
 
 
-def test_a_map_needs_a_pair_of_runs_and_a_name_of_a_picture(
-    paired: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    refused(["audit", paired[0], "--map", str(tmp_path / "map.png")], capsys, "--map", "same candidates")
-    refused(["audit", *paired, "--map", str(tmp_path / "map.pdf")], capsys, ".svg or .png")
-    refused(["audit", *paired, "--map", str(tmp_path / "none" / "map.png")], capsys, "its folder")
+@pytest.mark.usefixtures("priced")
+def test_labels_of_every_kind_carry_the_whole_cost_with_its_waste(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", n=50)  # 5 shards of 2 scenes and 10 labels
+    run.ledger.start("bad", 0)
+    killed = Cost(wall_s=2.5, cpu_s=0)
+    run.ledger.end(LedgerEntry(attempt="bad", shard=0, outcome="crashed", cost=killed))
+    report = audit_runs([run])
+    (source,) = report["sources"]
+    assert report["is_exact"] and source["total_core_s"] == pytest.approx(7.5)
+    assert source["core_s"] == pytest.approx(
+        {name: 5 * s for name, s in STAGES.items()}
+        | {"other": 0.5, "waste": 2.5, "scenes of other runs": 0, "relabelled files": 0}
+    )
+    rows = [rows_of(run, shard)[1] for shard in range(5)]
+    label, clear, mount_m, reach_m = (
+        np.concatenate([each[name] for each in rows])
+        for name in ("label", "base_is_clear", "mount_distance_m", "arm_reach_m")
+    )
+    near = (clear == 1) & (mount_m <= reach_m)
+    assert source["counts"] == {
+        "label": 50, "label_within_reach": near.sum(), "positive": label.sum(),
+        "positive_within_reach": label[near].sum(), "scene": 10,
+    }  # fmt: skip
+    for name, count in source["counts"].items():
+        assert source["core_s_per"][name] == (pytest.approx(7.5 / count) if count else None)
+    projection = source["projection"]
+    assert projection["core_days"] == pytest.approx(7.5 / 50 * PAPER_LABELS / 86400)
+    assert projection["bytes"] == pytest.approx(5e6 / 50 * PAPER_LABELS)
+    assert projection["paper_gpu_days"] == 3.0
 
 
-def test_prices_of_a_file_are_used_and_recorded(
-    paired: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    mine = tmp_path / "mine.toml"
-    text = DEFAULT_PRICES.read_text().replace('"USD"', '"EUR"').replace("price = 0.0425", "price = 0.425")
-    mine.write_text(text)
-    usual, given = (json_of(capsys, ["audit", *paired, *more]) for more in ([], ["--prices", str(mine)]))
-    assert given["prices"]["currency"] == "EUR" and given["prices"]["core_hour"]["source"]
-    money = [report["sources"][0]["cost_per"]["label"]["money"] for report in (usual, given)]
-    assert money[1] == pytest.approx(10 * money[0])  # these runs store no bytes
-    assert cli.run(["audit", *paired, "--prices", str(mine)]) == 0
-    assert "EUR" in capsys.readouterr().out
-    mine.write_text(text.replace("price = 0.425", "price = -1"))
-    refused(["audit", *paired, "--prices", str(mine)], capsys, "mine.toml", "core_hour.price", "costs.md")
+@pytest.mark.usefixtures("priced")
+def test_scenes_of_another_run_are_charged_where_that_run_is_named(tmp_path: Path) -> None:
+    maker = make_run(tmp_path / "maker", n=50)
+    borrower = relabelled(tmp_path / "borrower", maker, 20)  # 2 of the 5 shards
+    (alone,) = audit_runs([borrower])["sources"]
+    assert not alone["includes_scenes"] and alone["core_s_per"]["label"] == pytest.approx(2 / 20)
+    (both,) = audit_runs([borrower, maker])["sources"]
+    assert both["includes_scenes"] and both["core_s"]["scenes of other runs"] == pytest.approx(2 * 0.4)
+    assert both["core_s_per"]["label"] == pytest.approx(7.8 / 70)
 
 
-def test_costs_and_agreement_come_before_details(
-    paired: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.run(["audit", *paired]) == 0
-    told = capsys.readouterr().out
-    heads = [
-        "cost in core time", "money", "180,000 labels", "sums", "agreement with", "audit of", "first against",
-    ]  # fmt: skip
-    places = [told.index(f"\n{head}" if k else head) for k, head in enumerate(heads)]
-    assert places == sorted(places)
-    assert told.startswith("cost in core time") and Run.open(paired[1]).storage.url in told
+def test_a_terminal_shows_all_answers_in_25_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    maker = make_run(tmp_path / "maker", n=50)
+    run = relabelled(tmp_path / "run", maker, 50, seed=1)
+    maker.ledger.start("bad", 0)
+    maker.ledger.end(LedgerEntry(attempt="bad", shard=0, outcome="failed", cost=None, cause="ValueError: no"))
+    for paths in ([maker.storage.url], [maker.storage.url, run.storage.url]):
+        assert cli.run(["audit", *paths]) == 0
+        shown = capsys.readouterr().out
+        assert len(shown.splitlines()) <= 25
+        for answer in (
+            "labels",
+            "core time",
+            "1 failed of",
+            "ValueError: no",
+            "180,000 labels",
+            "< 3 GPU-days",
+        ):
+            assert answer in shown
+    assert "heuristic equals heuristic for" in shown
+    assert cli.run(["audit", run.storage.url]) == 0
+    assert "add the run that made its scenes" in capsys.readouterr().out
+
+
+def test_a_run_without_labels_is_audited(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = make_run(tmp_path / "run", n=50, shards=[])
+    assert cli.run(["audit", run.storage.url]) == 0
+    assert "none of 0" in capsys.readouterr().out

@@ -52,8 +52,7 @@ def test_runs_of_one_specification_give_the_store_of_one_run(
     assert files_of(apart / "first") == before
     spending = [json_of(capsys, ["audit", str(apart / name)])["sources"][0] for name in ("first", "whole")]
     (united,) = json_of(capsys, ["audit", str(out)])["sources"]
-    spent = united["useful"]["wall_s"] + sum(waste["wall_s"] for waste in united["waste"].values())
-    assert spent == pytest.approx(sum(book["useful"]["wall_s"] for book in spending), abs=1e-6)
+    assert united["wall_s"] == pytest.approx(sum(source["wall_s"] for source in spending), abs=1e-6)
     files = files_of(out)
     assert json_of(capsys, arguments)["runs"][0]["shards"]["linked"] == 0
     assert files_of(out) == files
@@ -83,7 +82,7 @@ def test_every_reading_verb_takes_it(merged: Path, tmp_path: Path, capsys: pytes
     status = json_of(capsys, ["status", str(merged)])
     assert (status["labels"], status["n"], status["complete"]) == (N + N // 2, N + N // 2, True)
     audit = json_of(capsys, ["audit", str(merged)])
-    assert audit["sources"][0]["labels"] == N + N // 2
+    assert audit["sources"][0]["counts"]["label"] == N + N // 2
     verified = json_of(capsys, ["verify", str(merged)])
     assert verified["findings"] == []
     second = -(-open_runs(merged)[0].n // 8)  # the first scene of the second part

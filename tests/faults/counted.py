@@ -211,17 +211,17 @@ def check_run(run: Run, counted: Path, kills: int = 0) -> dict[str, float]:
 
     recorder = account_for([run])
     waste = sum(account.attempts for account in recorder.waste.values())
-    assert recorder.useful.attempts == shards and recorder.running == 0
+    assert recorder.useful.attempts == shards and recorder.contradictions == 0
     assert recorder.useful.attempts + waste == len(ends) == len(set(ends) | starts)
-    assert isclose(recorder.total_wall_s, fsum(wall_s + lost_s), rel_tol=1e-9)
-    useful = recorder.useful
-    assert isclose(useful.wall_s, fsum(useful.stage_wall_s.values()) + useful.unnamed_wall_s, rel_tol=1e-9)
+    total_s = recorder.useful.wall_s + recorder.wasted.wall_s
+    assert isclose(total_s, fsum(wall_s + lost_s), rel_tol=1e-9)
+    assert set(recorder.difference_s.values()) == {0.0}
     return {
         "shards": shards,
         "executions": len(seen.begun),
         "cut at their beginning": len(seen.begins - seen.begun),
         "killed before it": len(unseen),
         "attempts wasted": waste,
-        "of these without account": sum(account.without_account for account in recorder.waste.values()),
-        "waste share of time": 1 - useful.wall_s / recorder.total_wall_s,
+        "of these without account": recorder.wasted.unknown,
+        "waste share of time": recorder.wasted.wall_s / total_s,
     } | {f"ended {outcome}": recorder.waste[outcome].attempts for outcome in sorted(recorder.waste)}

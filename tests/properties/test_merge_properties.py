@@ -195,8 +195,8 @@ def sums(spending: Sequence[Spending]) -> Counter[str]:
     total: Counter[str] = Counter()
     for each in spending:
         for account in (each.useful, *each.waste.values()):
-            total.update({"wall_s": account.wall_s, "cpu_s": account.cpu_s, "bytes": account.written_bytes})
-            total.update({f"stage {name}": s for name, s in account.stage_wall_s.items()})
+            total.update({"wall_s": account.wall_s, "core_s": account.core_s, "bytes": account.written_bytes})
+            total.update({f"stage {name}": s for name, s in account.stage_s.items()})
     return total
 
 

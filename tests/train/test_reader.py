@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datagen.reports.agreement import read_labelled
+from datagen.reports.agreement import read_labels
 from datagen.schemas import shard_reading
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
@@ -216,7 +216,7 @@ def test_chunks_that_were_swapped_between_shards_are_refused_by_every_reader(
         with pytest.raises(InputError, match=f"/{name}/c.*: {name}: .*another sha256 than the commit"):
             list(SampleReader([place], scenes, samples).shards())
     readers: list[Callable[[], object]] = [
-        lambda: read_labelled(run),
+        lambda: read_labels(run),
         lambda: read_scene(run, 0),
         lambda: list(SampleStream([place]).epoch(0)),
     ]

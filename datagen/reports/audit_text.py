@@ -1,0 +1,180 @@
+"""An audit as one table for a terminal, a column for each label source."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from datagen.console.printing import counted, print_lines, print_rows, seconds, size
+
+Source = Mapping[str, Any]
+
+# Costs that are no stages.
+_ADDED = ("other", "waste", "scenes of other runs", "relabelled files")
+_STAGES_SHOWN = 5
+_UNITS = {
+    "label": "core time of a label",
+    "label_within_reach": "  of a label within reach",
+    "positive": "  of a positive",
+}
+
+
+def print_audit(report: Mapping[str, Any]) -> None:
+    """Print what was made, its cost, the waste, and the cost of the paper's number of labels."""
+    if not report["is_exact"]:
+        print_lines(
+            f"the ledger does not add up: {counted(report['contradictions'], 'record')} and"
+            f" {report['difference_s']['wall']:.3g} s differ; `datagen verify RUN` names the records"
+        )
+    sources: Sequence[Source] = report["sources"]
+    title = "; ".join(dict.fromkeys(source["made_from"] for source in sources))
+    print_rows(title, audit_rows(sources), ("", *(source["label_source"] for source in sources)))
+    notes = [
+        f"{source['label_source']}: add the run that made its scenes, whose cost is missing here"
+        for source in sources
+        if not source["includes_scenes"]
+    ]
+    notes += [f"{cause} ({_attempts(account)})" for cause, account in _costliest(sources)]
+    notes += [
+        f"{first} equals {reference} for {equal} of {count} candidates within reach"
+        for first, reference, count, equal in agreement_rows(report["agreement"])
+        if equal != "-"
+    ]
+    print_lines("\n".join(notes))
+
+
+def audit_rows(sources: Sequence[Source]) -> list[tuple[str, ...]]:
+    """Rows of names and a cell for each label source: made, cost, waste, cost of the paper's labels."""
+    return [*_made(sources), *_cost(sources), *_waste(sources), *_projection(sources)]
+
+
+def agreement_rows(pairs: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str, str]]:
+    """For each pair: labels, reference, number of candidates, share of equal labels (- of none)."""
+    return [(pair["labels"], pair["reference"], f"{pair['candidates']:,}", _equal(pair)) for pair in pairs]
+
+
+def _row(name: str, sources: Sequence[Source], cell: Callable[[Source], str]) -> tuple[str, ...]:
+    return (name, *(cell(source) for source in sources))
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{part:,} ({100 * part / whole:.1f}%)" if whole else f"{part:,}"
+
+
+def _made(sources: Sequence[Source]) -> list[tuple[str, ...]]:
+    def cell(name: str, of: str) -> Callable[[Source], str]:
+        return lambda source: _share(source["counts"][name], source["counts"][of])
+
+    return [
+        _row("labels", sources, lambda s: f"{s['counts']['label']:,} in {s['counts']['scene']:,} scenes"),
+        _row("  positive", sources, cell("positive", "label")),
+        _row("  within reach", sources, cell("label_within_reach", "label")),
+        _row("    positive", sources, cell("positive_within_reach", "label_within_reach")),
+    ]
+
+
+def _cost(sources: Sequence[Source]) -> list[tuple[str, ...]]:
+    """Core time by stage, which adds up to the total, and that of a label."""
+    stages = list(dict.fromkeys(name for s in sources for name in s["core_s"] if name not in _ADDED))
+    largest = sorted(stages, key=lambda name: -max(_part(s, name) for s in sources))[:_STAGES_SHOWN]
+    small = [name for name in stages if name not in largest]
+
+    def cell(*names: str) -> Callable[[Source], str]:
+        def text(source: Source) -> str:
+            spent = sum(source["core_s"].get(name, 0.0) for name in names)
+            share = spent / source["total_core_s"] if source["total_core_s"] else 0.0
+            return f"{seconds(spent)}  {100 * share:3.0f}%" if spent else "-"
+
+        return text
+
+    rows = [_row("core time", sources, lambda source: seconds(source["total_core_s"]))]
+    rows += [_row(f"  {name}", sources, cell(name)) for name in stages if name in largest]
+    rows.append(_row("  other", sources, cell("other", *small)))
+    rows += [
+        _row(f"  {name}", sources, cell(name))
+        for name in _ADDED[1:]
+        if any(source["core_s"][name] for source in sources)
+    ]
+    for unit, name in _UNITS.items():
+        rows.append(_row(name, sources, lambda source, unit=unit: _short(source["core_s_per"][unit])))
+    return rows
+
+
+def _part(source: Source, name: str) -> float:
+    return source["core_s"].get(name, 0.0) / (source["total_core_s"] or 1.0)
+
+
+def _short(value_s: float | None) -> str:
+    if value_s is None:
+        return "-"
+    return (
+        f"{1000 * value_s:.3g} ms"
+        if value_s < 0.1
+        else f"{value_s:.3g} s"
+        if value_s < 600
+        else seconds(value_s)
+    )
+
+
+def _waste(sources: Sequence[Source]) -> list[tuple[str, ...]]:
+    def attempts(source: Source) -> str:
+        wasted = ", ".join(f"{account['attempts']:,} {kind}" for kind, account in source["waste"].items())
+        return f"{wasted or 'none'} of {source['attempts']:,}"
+
+    def scenes(source: Source) -> str:
+        rejected = sum(source["rejected_scenes"].values())
+        return f"{rejected:,} of {rejected + source['counts']['scene']:,} tries"
+
+    rows = [_row("wasted attempts", sources, attempts), _row("rejected scenes", sources, scenes)]
+    if any(source["rejected_scenes"] for source in sources):
+        rows.append(_row("  most often", sources, _commonest))
+    return rows
+
+
+def _commonest(source: Source) -> str:
+    found = sorted(source["rejected_scenes"].items(), key=lambda item: -item[1])[:2]
+    return ", ".join(f"{cause} {count:,}" for cause, count in found) or "-"
+
+
+def _projection(sources: Sequence[Source]) -> list[tuple[str, ...]]:
+    def days(source: Source, value: float | None, of: str = "") -> str:
+        """Days; simulated labels in weeks, as the paper states them."""
+        if value is None:
+            return "-"
+        is_sim = source["label_source"] == "sim"
+        return f"{value / 7 if is_sim else value:.2g} {of}{'weeks' if is_sim else 'days'}"
+
+    def paper(source: Source) -> str:
+        stated = source["projection"]["paper_gpu_days"]
+        bound = ">" if source["label_source"] == "sim" else "<"
+        return "-" if stated is None else f"{bound} {days(source, stated, 'GPU-')}"
+
+    def stored(source: Source) -> str:
+        value = source["projection"]["bytes"]
+        return "-" if value is None else size(value)
+
+    labels = sources[0]["projection"]["labels"]
+    return [
+        _row(f"{labels:,} labels, one core", sources, lambda s: days(s, s["projection"]["core_days"])),
+        _row("  within reach", sources, lambda s: days(s, s["projection"]["core_days_within_reach"])),
+        _row("  in the paper", sources, paper),
+        _row("  stored", sources, stored),
+    ]
+
+
+def _costliest(sources: Sequence[Source]) -> list[tuple[str, Mapping[str, Any]]]:
+    causes = [item for source in sources for item in source["causes"].items()]
+    return sorted(causes, key=lambda item: -item[1]["core_s"])[:2]
+
+
+def _attempts(account: Mapping[str, Any]) -> str:
+    return f"{counted(account['attempts'], 'attempt')}, {seconds(account['core_s'])}"
+
+
+def _equal(pair: Mapping[str, Any]) -> str:
+    if not pair["candidates"]:
+        return "-"
+    share = f"{100 * pair['equal_share']:.1f}%"
+    return share + (
+        "" if pair["interval"] is None else " [{:.1f}, {:.1f}]".format(*(100 * x for x in pair["interval"]))
+    )
