@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from datagen.console.printing import counted, seconds
+from datagen.console.printing import counted
 from datagen.display.figures import svg_of
 from datagen.display.html_page import escape, html_facts, html_figure, html_folded, html_table
 from datagen.display.styles import OUTCOME_STYLES
 from datagen.html_report.figures import FLOOR_CAPTION, draw_floor
 from datagen.html_report.run_columns import RunColumns, read_columns
-from datagen.reports.label_costs import audit_report
+from datagen.reports.audit import audit_runs
+from datagen.reports.audit_text import cost_rows
 from datagen.reports.run_status import status_report
-from datagen.reports.spending import account_for
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.shard_files import described
@@ -35,7 +35,7 @@ def run_section(run: Run, name: str) -> Iterator[str]:
         yield html_figure(svg_of(draw_floor(columns), name), FLOOR_CAPTION)
     yield from _causes(status, columns)
     yield "<h3>Cost</h3>"
-    yield html_table(("", "", ""), _cost(run))
+    yield html_table(("", ""), cost_rows(audit_runs([run])["sources"]))
     if columns is not None:
         yield from _scenes(run, columns)
     yield from _provenance(run)
@@ -93,11 +93,6 @@ def _words(cause: str) -> str:
 
 def _share(count: int, whole: int) -> str:
     return f"{100 * count / whole:.1f}%" if whole else "-"
-
-
-def _cost(run: Run) -> list[tuple[str, ...]]:
-    audit = audit_report(account_for([run]), run.manifest.spec.label_source)
-    return [("worker time", seconds(audit["useful"]["wall_s"]), "")]
 
 
 def _scenes(run: Run, columns: RunColumns) -> Iterator[str]:

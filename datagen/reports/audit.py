@@ -13,8 +13,8 @@ from typing import Any
 
 from datagen.reports.agreement import Labels, agreements, fidelity, read_labels
 from datagen.reports.spending import Account, Spending, account_for
-from datagen.schemas.cost import STAGES
 from datagen.schemas.run import Run
+from datagen.schemas.run_records import STAGES
 
 # GBPP: 180,000 distance-visibility labels in under three days on one RTX A5000, and over three weeks
 # for as many simulated ones.

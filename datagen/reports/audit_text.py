@@ -28,29 +28,22 @@ def print_audit(report: Mapping[str, Any]) -> None:
         )
     sources: Sequence[Source] = report["sources"]
     title = "; ".join(dict.fromkeys(source["made_from"] for source in sources))
-    print_rows(title, audit_rows(sources), ("", *(source["label_source"] for source in sources)))
+    print_rows(
+        title, [*_made(sources), *cost_rows(sources)], ("", *(source["label_source"] for source in sources))
+    )
     notes = [
         f"{source['label_source']}: add the run that made its scenes, whose cost is missing here"
         for source in sources
         if not source["includes_scenes"]
     ]
     notes += [f"{cause} ({_attempts(account)})" for cause, account in _costliest(sources)]
-    notes += [
-        f"{first} equals {reference} for {equal} of {count} candidates within reach"
-        for first, reference, count, equal in agreement_rows(report["agreement"])
-        if equal != "-"
-    ]
+    notes += [_agreement(pair) for pair in report["agreement"] if pair["candidates"]]
     print_lines("\n".join(notes))
 
 
-def audit_rows(sources: Sequence[Source]) -> list[tuple[str, ...]]:
-    """Rows of names and a cell for each label source: made, cost, waste, cost of the paper's labels."""
-    return [*_made(sources), *_cost(sources), *_waste(sources), *_projection(sources)]
-
-
-def agreement_rows(pairs: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str, str]]:
-    """For each pair: labels, reference, number of candidates, share of equal labels (- of none)."""
-    return [(pair["labels"], pair["reference"], f"{pair['candidates']:,}", _equal(pair)) for pair in pairs]
+def cost_rows(sources: Sequence[Source]) -> list[tuple[str, ...]]:
+    """Rows of a name and a cell for each label source: cost, waste, cost of the paper's labels."""
+    return [*_cost(sources), *_waste(sources), *_projection(sources)]
 
 
 def _row(name: str, sources: Sequence[Source], cell: Callable[[Source], str]) -> tuple[str, ...]:
@@ -171,10 +164,8 @@ def _attempts(account: Mapping[str, Any]) -> str:
     return f"{counted(account['attempts'], 'attempt')}, {seconds(account['core_s'])}"
 
 
-def _equal(pair: Mapping[str, Any]) -> str:
-    if not pair["candidates"]:
-        return "-"
-    share = f"{100 * pair['equal_share']:.1f}%"
-    return share + (
-        "" if pair["interval"] is None else " [{:.1f}, {:.1f}]".format(*(100 * x for x in pair["interval"]))
-    )
+def _agreement(pair: Mapping[str, Any]) -> str:
+    percent = [100 * bound for bound in pair["interval"] or ()]
+    bounds = f" [{percent[0]:.1f}, {percent[1]:.1f}]" if percent else ""
+    share = f"{100 * pair['equal_share']:.1f}%{bounds} of {pair['candidates']:,} candidates within reach"
+    return f"{pair['labels']} equals {pair['reference']} for {share}"

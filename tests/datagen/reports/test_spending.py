@@ -8,8 +8,7 @@ import pytest
 
 from datagen import cli
 from datagen.reports.spending import QUARANTINED, account_for
-from datagen.schemas.ledger import end_key
-from datagen.schemas.record_files import encode_record, utc_now
+from datagen.schemas.record_files import encode_record, end_key, utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, LedgerEntry, Outcome, QuarantineRecord
 from tests.made_runs import attempt, make_run, write
