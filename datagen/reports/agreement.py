@@ -15,7 +15,7 @@ from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_committed
 from datagen.schemas.specification import Specification
-from datagen.train.evaluation.bootstrap import Estimate
+from datagen.train.bootstrap import Estimate
 from datagen.workers.bases.candidate_sets import Bools, in_set
 
 # In ascending fidelity: the later of two is the reference for the earlier.
