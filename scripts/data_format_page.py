@@ -29,7 +29,7 @@ RUN/
   quarantine/<shard>.json        a quarantined shard: seeds, causes, stacks
   quarantine/<shard>.lifted-<k>.json  a former quarantine record of a shard that was tried again
   jobs/<job>.json                a driver; .state.json is its state, .stop a stop request
-  index/<digest>.json.gz         summaries of settled records: a cache, may be removed
+  set-aside/<time>/...           damaged shards and records that `verify --repair` moved away; not read
   lineage.json                   of a merged run: the runs that made its shards
   data.zarr/                     after sealing: one flat Zarr v3 store over all committed shards
 ```
@@ -60,8 +60,7 @@ Attributes: `units` (SI, `1` for numbers without one), `long_name`, `frame`, `va
 
 `data.zarr` has consolidated metadata. Its root attributes hold the specification and, by {CONVENTIONS},
 `title`, `summary`, `source`, `license` and `acknowledgement` of the assets, `references`, `history` and
-`comment`. Its arrays also have `coordinates`, and `flag_values` with `flag_meanings`. Stores that an older
-program sealed lack these attributes and remain valid; sealing again adds them.
+`comment`. Its arrays also have `coordinates`, and `flag_values` with `flag_meanings`.
 
 [Read the data](../guides/read-data.md) opens a store; [Python](../guides/python.md#tables-of-candidates)
 joins samples and scenes to a table.
