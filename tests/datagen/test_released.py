@@ -20,9 +20,9 @@ import datagen
 from datagen import cli, released
 from datagen.evaluation.benchmark import read_benchmark
 from datagen.evaluation.methods import open_models
-from datagen.released.card import card_text
 from datagen.train.scorers import weights_sha256
 from datagen.train.training.checkpoints import read_checkpoint
+from scripts.release_model import card_text
 from tests.conftest import REPOSITORY
 from tests.refusals import refused
 from tests.small_runs import json_of
