@@ -71,13 +71,12 @@ def prints(printer: Callable[..., int]) -> Callable[[Verb], Verb]:
 
 def given_options(options: Any) -> dict[str, Any]:
     """The options of a dataclass that differ from their defaults, by their names on the command line."""
-    return {
-        "--" + field.name.replace("_", "-"): value
-        for field in fields(options)
-        if field.kw_only
-        and field.name != "quiet"
-        and (value := getattr(options, field.name)) != field.default
-    }
+    own, given = type(options).__annotations__, dict[str, Any]()
+    for each in sorted(fields(options), key=lambda each: each.name not in own):
+        value = getattr(options, each.name)
+        if each.kw_only and each.name != "quiet" and value != each.default:
+            given["--" + each.name.replace("_", "-")] = value
+    return given
 
 
 def words_of(options: Mapping[str, object]) -> list[str]:
