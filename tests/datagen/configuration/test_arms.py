@@ -76,7 +76,7 @@ def test_the_option_wins_over_the_file_and_the_file_over_the_default() -> None:
         ("sim", {}, 0, ["--perturb: 0:", "greater than or equal to 1"]),
         ("sim", {}, -1, ["--perturb: -1:", "greater than or equal to 1"]),
         ("sim", {}, 1001, ["--perturb: 1001:", "less than or equal to 1000"]),
-        ("plan", {"arm": {"robot": "hal"}}, None, ["run.toml: arm.robot:", "'hal'", "panda-scaled"]),
+        ("plan", {"arm": {"robot": "hal"}}, None, ["run.toml: arm.robot:", "hal", "panda-scaled"]),
     ],
 )
 def test_contradictions_are_refused(
