@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,13 +11,14 @@ import numpy.typing as npt
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import inverse, rotation_of, translation
 from datagen.workers.robots.description import Gripper, Parts
-from datagen.workers.settling.sapien_physics import add_object, convex_shape, pad_material, sapien_pose
-
-with warnings.catch_warnings():
-    # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.
-    warnings.simplefilter("ignore")
-    import sapien
-    from sapien import physx
+from datagen.workers.settling.sapien_physics import (
+    add_object,
+    convex_shape,
+    pad_material,
+    physx,
+    sapien,
+    sapien_pose,
+)
 
 Bools = npt.NDArray[np.bool_]
 
@@ -38,8 +38,8 @@ class HandTest:
     normal error, as with an arm.
     """
 
-    grip_force_n: float = 40.0  # of each finger
-    closing_mps: float = 0.1  # of each finger
+    grip_force_n: float = 40.0  # each finger
+    closing_mps: float = 0.1  # each finger
     object_friction: float = 0.6
     finger_friction: float = 2.0
     close_s: float = 0.2

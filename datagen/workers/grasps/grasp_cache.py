@@ -68,7 +68,7 @@ Bools = npt.NDArray[np.bool_]
 
 _NO_SCORE = np.zeros(0, np.float32)
 _KEPT_IN_MEMORY = 128
-_POSES = CacheFolder("hand-poses", most_files=1024)  # of some 250 KB each
+_POSES = CacheFolder("hand-poses", most_files=1024)  # about 250 KB each
 _SCORES = CacheFolder("grasps", most_files=65_536)
 # Grasps of an object that are scored in advance; the others only when an arm has a plan to them.
 SCORED_FIRST = 128

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -25,25 +25,13 @@ class LabelSource:
 
     `label` returns, one row per candidate, the columns of the schema that depend on the scene: `label` and
     its explanation. `schema` names the record schema of its store, and `version` is raised when the same
-    input may give another label. Slow sources have `label_rows`, which computes the labels of some candidates
-    alone, with equal values.
+    input may give another label.
     """
 
     name: str
     version: int
     schema: str
     label: Callable[[SettledScene, SceneCandidates, Specification, StageClock], Columns]
-    label_rows: (
-        Callable[[SettledScene, SceneCandidates, Specification, StageClock, Sequence[int]], Columns] | None
-    ) = None
-
-    def columns(
-        self, scene: SettledScene, candidates: SceneCandidates, spec: Specification, rows: Sequence[int]
-    ) -> Columns:
-        """The columns of the candidates `rows`, as `label` gives them among all."""
-        if self.label_rows is not None:
-            return self.label_rows(scene, candidates, spec, StageClock(), rows)
-        return {name: a[list(rows)] for name, a in self.label(scene, candidates, spec, StageClock()).items()}
 
 
 LABEL_SOURCES: dict[str, str] = {

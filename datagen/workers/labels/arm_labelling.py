@@ -43,13 +43,13 @@ class CandidateTrial:
     """The results for one candidate."""
 
     outcome: str
-    report: PlanReport | None = None  # of planning at the candidate; None where no planning was needed
+    report: PlanReport | None = None  # planning at the candidate; None where no planning was needed
     plan: MotionPlan | None = None  # that of the report
-    results: tuple[TrialResult, ...] = ()  # of the executions
+    results: tuple[TrialResult, ...] = ()  # one for each execution
     T_world_base: tuple[F64, ...] = ()  # (4, 4) each, poses of the mount in them
     successes: int = 0
     trials: int = 0  # attempts of which `successes` succeeded: 1, or the disturbed repeats; 0 if none
-    retry_outcome: str | None = None  # of the last grasp executed after the first one failed
+    retry_outcome: str | None = None  # the last grasp executed after the first one failed
 
 
 @dataclass(eq=False)

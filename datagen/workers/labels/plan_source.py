@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from datagen.schemas.outcomes import OUTCOMES
@@ -28,31 +26,19 @@ _CODES = {name: code for code, name in enumerate(OUTCOMES)}
 
 
 def label(
-    scene: SettledScene,
-    candidates: SceneCandidates,
-    spec: Specification,
-    clock: StageClock,
-    rows: Sequence[int] | None = None,
+    scene: SettledScene, candidates: SceneCandidates, spec: Specification, clock: StageClock
 ) -> Columns:
-    """The columns of the heuristic, and results of planning; `rows` selects candidates."""
-    return label_with_trials(scene, candidates, spec, clock, rows)[0]
+    """The columns of the heuristic, and results of planning."""
+    return label_with_trials(scene, candidates, spec, clock)[0]
 
 
 def label_with_trials(
-    scene: SettledScene,
-    candidates: SceneCandidates,
-    spec: Specification,
-    clock: StageClock,
-    rows: Sequence[int] | None = None,
+    scene: SettledScene, candidates: SceneCandidates, spec: Specification, clock: StageClock
 ) -> tuple[Columns, list[CandidateTrial]]:
-    """The columns of `plan`, and the trials behind them, one for each candidate of `rows` [all]."""
+    """The columns of `plan`, and the trial behind each row."""
     columns = heuristic_source.label(scene, candidates, spec, clock)
-    if rows is None:
-        rows = range(len(candidates))
-    else:
-        columns = {name: values[list(rows)] for name, values in columns.items()}
     columns["heuristic_label"] = columns["label"]
-    n = len(rows)
+    n = len(candidates)
     columns |= {
         "outcome": np.zeros(n, np.uint8),
         "grasps_free": np.zeros(n, np.int16),
@@ -67,15 +53,15 @@ def label_with_trials(
     }
     arms: dict[tuple[float, float], ArmInScene] = {}
     trials: list[CandidateTrial] = []
-    for k, row in enumerate(rows):
+    for row in range(n):
         key = (float(candidates.arm_reach_m[row]), float(candidates.base_height_m[row]))
         if key not in arms:
             arms[key] = arm_in_scene(scene, candidates, row, spec, clock)
         trial = try_candidate(arms[key], candidates, row, spec)
         trials.append(trial)
-        _write(columns, k, trial)
+        _write(columns, row, trial)
         if trial.plan is not None:
-            _write_plan(columns, k, arms[key], arms[key].base_pose(candidates, row), trial.plan)
+            _write_plan(columns, row, arms[key], arms[key].base_pose(candidates, row), trial.plan)
     columns["label"] = (columns["outcome"] == _CODES["success"]).astype(np.uint8)
     return columns, trials
 
@@ -96,4 +82,4 @@ def _write_plan(columns: Columns, k: int, at: ArmInScene, T_world_base: F64, pla
     columns["path_clearance_m"][k] = plan.clearance_m
 
 
-PLAN = LabelSource("plan", VERSION, "plan", label, label)
+PLAN = LabelSource("plan", VERSION, "plan", label)

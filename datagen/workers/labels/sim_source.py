@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from datagen.schemas.outcomes import RETRY_OUTCOMES
@@ -20,14 +18,10 @@ _RETRY_CODES = {name: code for code, name in enumerate(RETRY_OUTCOMES)}
 
 
 def label(
-    scene: SettledScene,
-    candidates: SceneCandidates,
-    spec: Specification,
-    clock: StageClock,
-    rows: Sequence[int] | None = None,
+    scene: SettledScene, candidates: SceneCandidates, spec: Specification, clock: StageClock
 ) -> Columns:
-    """The columns of `plan_source`, with outcomes and measurements of trials; `rows` selects candidates."""
-    columns, trials = plan_source.label_with_trials(scene, candidates, spec, clock, rows)
+    """The columns of `plan_source`, with outcomes and measurements of trials."""
+    columns, trials = plan_source.label_with_trials(scene, candidates, spec, clock)
 
     def column(dtype: str, values: list[float]) -> np.ndarray:
         return np.array(values, dtype)
@@ -43,4 +37,4 @@ def label(
     return columns
 
 
-SIM = LabelSource("sim", VERSION, "sim", label, label)
+SIM = LabelSource("sim", VERSION, "sim", label)

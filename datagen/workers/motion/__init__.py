@@ -17,7 +17,7 @@ class MotionPlan:
     q_approach_rad: F64  # (K, A), pregrasp to grasp, along a straight line of the TCP
     q_lift_rad: F64  # (J, A), grasp to lifted, straight up
     opening_m: float
-    length_rad: float  # of the reach and the approach, Euclidean in joint space
+    length_rad: float  # reach and approach, Euclidean in joint space
     clearance_m: float  # smallest distance of arm and scene over q_reach_rad
     grasp_score: float  # share of floating-hand pulls that held
 

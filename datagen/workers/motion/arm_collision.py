@@ -21,7 +21,7 @@ class Surroundings:
     scene: PlanningScene
     T_world_base: F64  # (4, 4)
     near: Placed
-    is_target: Bools  # of the near parts
+    is_target: Bools  # near parts that are the target's
     arm: Hulls
     arm_may_touch: Bools  # (arm's parts, near parts)
     hand_may_touch: Bools  # (hand's parts, near parts)

@@ -27,7 +27,7 @@ class Hand:
     """A gripper's parts: owners 0, 1 and 2 are the palm, the finger towards +y and the one towards -y."""
 
     hulls: Hulls
-    digest: str  # of the gripper
+    digest: str  # the gripper's
 
     def poses(self, T_tcp: F64, opening_m: F64) -> F64:
         """Poses (M, 3, 4, 4) of the owners, in the frame of the TCP's poses (M, 4, 4); openings (M,)."""

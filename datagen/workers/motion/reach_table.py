@@ -22,7 +22,7 @@ _DISTANCE_EPS = 1.0  # largest relative error of the nearest distance: halves th
 _SEED_EPS = 0.3  # the same for seeds
 _PER_SEED = 6  # samples near a pose among which each of its seeds is chosen
 _APART_RAD = 1.0  # seeds with all joints nearer than this often lead to one solution
-_DIGITS = 6  # of an arm's numbers, in units of its length: scaled copies of an arm share samples
+_DIGITS = 6  # digits of an arm's numbers, in units of its length: scaled copies of an arm share samples
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,8 @@ class ObjectModel:
     name: str  # "011_banana"
     digest: str  # sha256 over the files, or the parameters, that it is made from
     mass_kg: float
-    size_m: tuple[float, float, float]  # of the bounding box
-    radius_m: float  # of the smallest origin-centred sphere that holds every visual vertex
+    size_m: tuple[float, float, float]  # sides of the bounding box
+    radius_m: float  # radius of the smallest origin-centred sphere that holds every visual vertex
     visual: Mesh
     convex_parts_m: tuple[F32, ...]
     can_be_target: bool  # fits a parallel gripper with an 8 cm stroke from some side
@@ -31,7 +31,7 @@ class ObjectSource(Protocol):
     """A named set of objects. `excluded` maps excluded objects to the reasons."""
 
     kind: str
-    digest: str  # of the content, not of the path
+    digest: str  # digest of the content, not of the path
     excluded: Mapping[str, str]
 
     def names(self) -> list[str]:

@@ -31,10 +31,10 @@ MERGER_VERSION = 2
 MAX_VERTICES = 64
 # Number of parts that a part is paired with: those whose bounding boxes are nearest.
 _NEIGHBOURS = 12
-_CELLS_ACROSS = 32  # of the distance grid, along the object's longest side
+_CELLS_ACROSS = 32  # cells of the distance grid along the object's longest side
 # Hulls whose errors differ by less are compared by the volume they add.
 _ERROR_STEP_M = 2e-4
-_CACHE = CacheFolder("hulls", most_files=4096)  # of some 20 KB each
+_CACHE = CacheFolder("hulls", most_files=4096)  # about 20 KB each
 _known: dict[str, tuple[F32, ...]] = {}
 
 

@@ -43,7 +43,7 @@ def _count(scene: RayScene, target: int, eyes_m: F64, distance_m: F64, window: i
     T_world_target = scene.T_world_object[target]
     axes = np.stack([look_at(eye, T_world_target[:3, 3])[:3, :3] for eye in eyes_m])  # (n, 3, 3)
     sine = scene.radii_m[target] / distance_m
-    half_width = sine / np.sqrt(1 - sine**2)  # of the window, at depth 1
+    half_width = sine / np.sqrt(1 - sine**2)  # half of the window at depth 1
     eye, x, y = _window_rays(scene.objects[target], T_world_target, eyes_m, axes, half_width, window)
 
     # Alone, in the target's own frame.

@@ -19,7 +19,7 @@ class RobotLimits:
 
     reach_m: tuple[float, float]
     base_height_m: tuple[float, float] | None  # None: a pedestal of any height
-    base_radius_m: float | None  # of its own mobile base; None stands on a pedestal
+    base_radius_m: float | None  # its own mobile base; None stands on a pedestal
     # Corners (x, y) of its base's outline in the base frame: origin below the mount, x to the front.
     footprint_m: tuple[tuple[float, float], ...] | None = None
 
@@ -110,9 +110,9 @@ class Gripper:
     """
 
     name: str
-    digest: str  # of all other fields; a key of caches
+    digest: str  # digest of all other fields; a key of caches
     max_opening_m: float
-    pad_size_m: tuple[float, float]  # of the rubber that touches: along x and along z
+    pad_size_m: tuple[float, float]  # rubber that touches: along x and along z
     palm_depth_m: float  # from the TCP back to the palm's surface, along -z
     palm_parts_m: Parts  # TCP frame
     finger_parts_m: tuple[Parts, Parts]  # TCP frame, fingers closed (opening 0)

@@ -30,7 +30,7 @@ _read_visual = lru_cache(maxsize=64)(read_glb)
 POSITION_TOLERANCE_M = 0.0005
 ANGLE_TOLERANCE_RAD = float(np.radians(0.5))
 _MAX_STEPS = 40
-_LONGEST_STEP_RAD = 1.0  # of any joint
+_LONGEST_STEP_RAD = 1.0  # any joint
 _DAMPING = 1e-4
 _DAMPING_PER_ERROR = 0.003
 # Fails when the best error has not fallen to this share within this number of steps.

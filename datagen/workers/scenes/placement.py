@@ -87,7 +87,7 @@ def drop_poses(
     target_xy = np.zeros(2)
     for k, model in enumerate(models):
         near_tries = 0 if k == 0 else _NEAR_TRIES
-        footprints = stack_polygons([*placed, np.zeros((4, 2))])[:-1]  # of at least four corners
+        footprints = stack_polygons([*placed, np.zeros((4, 2))])[:-1]  # at least four corners each
         state = rng.bit_generator.state
         # Each try uses three numbers of the stream: the yaw, then angle and radius, or x and y.
         numbers = rng.random((near_tries + _FAR_TRIES, 3))

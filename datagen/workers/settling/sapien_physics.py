@@ -20,6 +20,7 @@ with warnings.catch_warnings():
     import sapien
     from sapien import physx
 
+_UNSCALED = [1.0, 1.0, 1.0]
 _CHECK_EVERY = 5  # steps between checks of the speeds: reading them costs as much as a step
 
 
@@ -69,15 +70,6 @@ def _deepest_contact(scene: sapien.Scene) -> float:
     """Depth in metres of the deepest contact point of the last step; 0 when nothing touches."""
     depths = [point.separation for contact in scene.get_contacts() for point in contact.points]
     return max(0.0, -min(depths)) if depths else 0.0
-
-
-with warnings.catch_warnings():
-    # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.
-    warnings.simplefilter("ignore")
-    import sapien
-    from sapien import physx
-
-_UNSCALED = [1.0, 1.0, 1.0]
 
 
 def pad_material(object_friction: float, finger_friction: float) -> physx.PhysxMaterial:

@@ -15,7 +15,7 @@ PHASES = ("reach", "approach", "close", "lift", "hold")
 # Share of the joints' speed limits at which the arm moves, as is usual near people and objects.
 SPEED_SHARE = 0.5
 _ARRIVE_S = 0.1  # for the drives to catch up before the next phase
-_CLOSING_SHARE = 0.8  # of close_s, in which the fingers' targets travel; then they press
+_CLOSING_SHARE = 0.8  # share of close_s in which the fingers' targets travel; then they press
 # Newtons per metre and newton seconds per metre of a finger's drive. Stiff, so that an object's weight
 # along the closing axis moves it by a millimetre or two against the hand.
 FINGER_STIFFNESS, FINGER_DAMPING = 4000.0, 200.0
@@ -27,7 +27,7 @@ class ControlPeriod:
 
     phase: str
     arm_rad: F64  # (A,)
-    finger_m: float | None  # of both fingers; None presses with the grip's force
+    finger_m: float | None  # both fingers; None presses with the grip's force
     joints_rad: F64  # (A,) planned at its end
     ends_phase: bool = False
 
@@ -128,7 +128,7 @@ def time_parameterized(path_rad: F64, speed_radps: F64, period_s: float, at_leas
     cells = np.maximum(1, np.ceil(lengths / _GRID_RAD).astype(int))
     if cells.sum() == 1:
         cells += 1  # at rest at both ends: there must be a point between them that moves
-    line = np.repeat(np.arange(len(lengths)), cells)  # of each grid cell
+    line = np.repeat(np.arange(len(lengths)), cells)  # line of each grid cell
     ds = np.repeat(lengths / cells, cells)
     s = np.concatenate([[0.0], np.cumsum(ds)])
     v2 = np.concatenate([[0.0], np.minimum(fastest[line[:-1]], fastest[line[1:]]) ** 2, [0.0]])

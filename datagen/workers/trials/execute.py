@@ -31,11 +31,13 @@ _JOINT_OFF_RAD, _TCP_OFF_M = 0.05, 0.015
 # Farther behind its path than this, the arm is pushing against something.
 _BLOCKED_RAD = 0.3
 _EMPTY_OPENING_M = 0.001
-LIFTED_SHARE = 0.8  # of the hand's planned rise, for success
-RISEN_SHARE = 0.5  # of it, for a lost target to count as dropped, not slipped, and to clear its support
+LIFTED_SHARE = 0.8  # share of the hand's planned rise that is a success
+RISEN_SHARE = (
+    0.5  # share of it from which a lost target counts as dropped, not slipped, and is off its support
+)
 # A finger holds where it pushes with at least this share of the grip's force along the closing axis.
 HOLDS_SHARE = 0.1
-_PLAYED_STEP_RAD = 0.04  # of the joint that moves farthest
+_PLAYED_STEP_RAD = 0.04  # motion of the joint that moves farthest
 _LOOK_STEPS = 4  # last steps of a phase, after each of which contacts are checked
 # An object whose energy would carry it this much higher than the hand rises has been thrown by the solver.
 _THROWN_M = 0.15
@@ -93,7 +95,7 @@ class _Trial:
     T_tcp_target: F64 | None = None  # when the hand had closed
     grasped_z_m: float = 0.0  # height of the TCP then
     T_tcp_held: F64 | None = None  # at the end of lifting, then after each control period of holding
-    still_periods: int = 0  # of holding, without a break, in which the target hardly moved in the hand
+    still_periods: int = 0  # periods of holding without a break in which the target hardly moved in the hand
     moments: list[tuple[float, F64, F64, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,18 +13,14 @@ from datagen.workers.settling.sapien_physics import (
     convex_shape,
     object_body,
     pad_material,
+    physx,
     pose_of,
+    sapien,
     sapien_pose,
     static_body,
 )
 from datagen.workers.trials.drive_targets import FINGER_DAMPING, FINGER_STIFFNESS
 from datagen.workers.trials.trial_scene import Articulation, MovableObjects
-
-with warnings.catch_warnings():
-    # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.
-    warnings.simplefilter("ignore")
-    import sapien
-    from sapien import physx
 
 # Collision groups [own kinds, kinds to collide with, -, -]: shapes collide where one lists the other's kind.
 # Objects collide with everything. The arm collides with objects and static parts, never with itself: the

@@ -9,7 +9,7 @@ from datagen.workers.robots.robot import Robot
 
 Case = tuple[str, float | None, float]
 
-_SHARES_OF_REACH = (0.0, 0.1, 0.3, 0.65, 1.0)  # of the range of a robot that is scaled
+_SHARES_OF_REACH = (0.0, 0.1, 0.3, 0.65, 1.0)  # shares of the range of a robot that is scaled
 _ON_PEDESTAL_M = 0.8
 
 
