@@ -93,22 +93,22 @@ class Drawing:
             pybullet.changeVisualShape(body, -1, textureUniqueId=texture, physicsClientId=self._world)
             self._label_of_body.append(label)
 
-    def render(self, camera: Camera) -> Frame:
+    def render(self, camera: Camera, near_m: float = _NEAR_M) -> Frame:
         """The frame that a camera sees; its bodies are the labels, -1 for none."""
-        rgba, buffer, segments = self._image(camera)
+        rgba, buffer, segments = self._image(camera, near_m)
         body = np.array([*self._label_of_body, -1], np.int16)[segments]  # -1 is the background
         # The buffer holds OpenGL's window depth, which is not linear in metres.
-        depth_m = _FAR_M * _NEAR_M / (_FAR_M - (_FAR_M - _NEAR_M) * buffer.astype(np.float64))
+        depth_m = _FAR_M * near_m / (_FAR_M - (_FAR_M - near_m) * buffer.astype(np.float64))
         depth_m[body < 0] = 0.0
         return Frame(camera, np.ascontiguousarray(rgba[..., :3]), depth_m.astype(np.float32), body)
 
-    def _image(self, camera: Camera) -> tuple[U8, F32, npt.NDArray[np.int32]]:
+    def _image(self, camera: Camera, near_m: float) -> tuple[U8, F32, npt.NDArray[np.int32]]:
         h, w = camera.height_px, camera.width_px
         _, _, rgba, buffer, segments = pybullet.getCameraImage(
             w,
             h,
             _view_matrix(camera),
-            _projection_matrix(camera),
+            _projection_matrix(camera, near_m),
             lightDirection=_LIGHT_DIRECTION,
             lightAmbientCoeff=_AMBIENT,
             lightDiffuseCoeff=_DIFFUSE,
@@ -131,7 +131,7 @@ def _view_matrix(camera: Camera) -> list[float]:
     return columns
 
 
-def _projection_matrix(camera: Camera) -> list[float]:
+def _projection_matrix(camera: Camera, near_m: float) -> list[float]:
     """OpenGL's projection for a pinhole with any principal point, by columns."""
     w, h = camera.width_px, camera.height_px
     # TinyRenderer samples a pixel at its lower left corner, not at its centre (measured).
@@ -139,8 +139,8 @@ def _projection_matrix(camera: Camera) -> list[float]:
     P = np.zeros((4, 4))
     P[0, 0], P[0, 2] = 2 * camera.fx_px / w, 1 - 2 * cx_px / w
     P[1, 1], P[1, 2] = 2 * camera.fy_px / h, 2 * cy_px / h - 1
-    P[2, 2] = -(_FAR_M + _NEAR_M) / (_FAR_M - _NEAR_M)
-    P[2, 3] = -2 * _FAR_M * _NEAR_M / (_FAR_M - _NEAR_M)
+    P[2, 2] = -(_FAR_M + near_m) / (_FAR_M - near_m)
+    P[2, 3] = -2 * _FAR_M * near_m / (_FAR_M - near_m)
     P[3, 2] = -1.0
     columns: list[float] = P.T.ravel().tolist()
     return columns

@@ -133,7 +133,7 @@ def test_the_places_of_clear_candidates_are_spread_as_the_clear_cells_are() -> N
     np.testing.assert_allclose(drawn.std(0), clear.std(0), atol=0.05)
 
 
-def test_cells_come_again_only_where_too_few_serve() -> None:
+def test_cells_repeat_only_where_too_few_are_clear() -> None:
     # A base almost as wide as the way between table and wall: few cells are clear.
     wide = {"base_radius_m": 0.43, "jitter": False, **SAME_HEIGHTS}
     grid = draw(per_scene="grid", **wide)
@@ -153,7 +153,7 @@ def test_cells_come_again_only_where_too_few_serve() -> None:
         {"within": "in-range", "arm_reach_m": {"low": 0.05, "high": 0.05}},
     ],
 )
-def test_a_scene_without_such_a_place_has_no_candidates(params: dict[str, object]) -> None:
+def test_a_scene_without_room_has_no_candidates(params: dict[str, object]) -> None:
     chosen = CandidateParams.model_validate(params)
     assert draw_candidates(TARGET, OBSTACLES, chosen, np.random.default_rng(0)) is None
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
 
 from datagen.schemas.specification import CandidateParams
 from datagen.workers.bases.candidates import (
@@ -106,95 +104,3 @@ def test_candidates_are_those_of_trying_every_robot_everywhere(
         for name in ("base_xy_m", "robot_index", "camera_height_m", "base_height_m", "arm_reach_m"):
             np.testing.assert_array_equal(getattr(made, name), getattr(plain, name), name)
         np.testing.assert_array_equal(made.clearance_m, plain.clearance_m)
-
-
-Drawn = tuple[int, np.ndarray, SceneCandidates]
-HOUSES = [
-    table_house(),
-    table_house([cupboard(0, 0.05), cupboard(1, 0.05), cupboard(3, 0.02)]),
-    table_house([cupboard(1, 0.3), cupboard(2, 0.35), cupboard(3, 0.2)]),
-    table_house([cupboard(k, 0.0, 1.0) for k in range(4)]),
-]
-OBSTACLES = [obstacles_of(house) for house in HOUSES]
-PARAMS = CandidateParams(within="in-range", per_scene=2, robots_per_scene=2, grid_cells=13, scaled_base=True)
-
-
-def draw_target(rng: np.random.Generator) -> tuple[int, np.ndarray]:
-    """A house, and a target anywhere on its table."""
-    offset = (rng.random(2) - 0.5) * TABLE_SIZE_M
-    return int(rng.integers(len(HOUSES))), np.array([*(np.array(MIDDLE) + offset), TABLE_TOP_M + 0.05])
-
-
-def drawn(rng: np.random.Generator) -> Drawn:
-    """A scene as it is drawn: house and target are rejected together where too few robots have room."""
-    while True:
-        house, target_m = draw_target(rng)
-        candidates = draw_candidates(target_m, OBSTACLES[house], PARAMS, rng)
-        if candidates is not None:
-            return house, target_m, candidates
-
-
-def by_rejection(rng: np.random.Generator) -> Drawn:
-    """The distribution as it is stated: the first robots that fit, each at any position in the set."""
-    params = PARAMS.model_copy(update={"per_scene": 1, "robots_per_scene": 1})
-    cells, step_m = grid_offsets(params), 2 / 12
-    while True:
-        house, target_m = draw_target(rng)
-        found: list[SceneCandidates] = []
-        for _ in range(DRAWS_A_ROBOT * 2):
-            shape = ROUNDS * len(cells)
-            camera, mount, reach = (
-                np.full(shape, rng.uniform(r.low, r.high), np.float32)
-                for r in (params.camera_height_m, params.base_height_m, params.arm_reach_m)
-            )
-            jitter_m = rng.uniform(-step_m / 2, step_m / 2, (shape, 2))
-            xy_m = (target_m[:2] + np.tile(cells, (ROUNDS, 1)) + jitter_m).astype(np.float32)
-            there = SceneCandidates(xy_m, np.zeros(shape, np.int16), camera, mount, reach, np.zeros(shape))
-            near = np.flatnonzero(distances(there, target_m)[1] <= reach)
-            there = SceneCandidates(*(column[near] for column in vars(there).values()))
-            radius_m = params.radius_of_base_m(there.arm_reach_m)
-            heights = (there.base_height_m, there.camera_height_m)
-            clearance_m = base_clearance_m(
-                there.base_xy_m, *heights, radius_m, OBSTACLES[house], params.mast_radius_m
-            )
-            there = replace(there, clearance_m=clearance_m)
-            inside = np.flatnonzero(clearance_m >= 0)
-            if len(inside):
-                k = rng.choice(inside)
-                found.append(SceneCandidates(*(column[k : k + 1] for column in vars(there).values())))
-            if len(found) == 2:
-                columns = (np.concatenate([vars(one)[name] for one in found]) for name in vars(found[0]))
-                return house, target_m, SceneCandidates(*columns)
-
-
-def samples(draw: Callable[[np.random.Generator], Drawn], n: int, seed: int) -> dict[str, np.ndarray]:
-    """Quantities of n scenes, one row each."""
-    rng = np.random.default_rng(seed)
-    rows: dict[str, list[float]] = {}
-    for _ in range(n):
-        house, target_m, candidates = draw(rng)
-        base_m = candidates.base_xy_m - target_m[:2]
-        row = {
-            **{"house": house, "target x": target_m[0], "target y": target_m[1]},
-            **{"base x": base_m[0, 0], "base y": base_m[0, 1], "mount": candidates.base_height_m[0]},
-            **{"camera": candidates.camera_height_m[0], "reach": candidates.arm_reach_m[0]},
-            **{"base x of the second": base_m[1, 0], "reach of the second": candidates.arm_reach_m[1]},
-        }
-        for name, value in row.items():
-            rows.setdefault(name, []).append(float(value))
-    return {name: np.array(values) for name, values in rows.items()}
-
-
-def test_the_distribution_is_the_stated_one() -> None:
-    """Ten two-sample tests at a level of 0.1 % each: of a hundred sound draws, one would fail by chance."""
-    made, plain = samples(drawn, 250, 1), samples(by_rejection, 250, 2)
-    for name in made:
-        if name == "house":
-            counts = [np.bincount(table[name].astype(int), minlength=len(HOUSES)) for table in (made, plain)]
-            kept = np.sum(counts, axis=0) > 0
-            p = stats.chi2_contingency(np.array(counts)[:, kept]).pvalue
-        else:
-            p = stats.ks_2samp(made[name], plain[name]).pvalue
-        assert p > 0.001, (name, p)
-    # The condition is felt: short arms fit less often.
-    assert stats.kstest(made["reach"], stats.uniform(0.3, 0.7).cdf).pvalue < 0.001

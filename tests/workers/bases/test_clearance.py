@@ -41,14 +41,14 @@ def test_a_low_base_may_stand_under_the_table_but_its_mast_may_not() -> None:
     assert clearance(ROOM_M[0] / 2, MIDDLE_Y, base_height_m=0.5, camera_height_m=0.6) > 0
 
 
-def test_walls_count_and_so_does_the_end_of_the_room() -> None:
+def test_walls_and_the_end_of_the_room_are_obstacles() -> None:
     assert clearance(0.25 + 0.2, MIDDLE_Y) == pytest.approx(0.2, abs=1e-6)
     assert clearance(0.1, MIDDLE_Y) == pytest.approx(-0.15, abs=1e-6)
     assert clearance(-0.05, MIDDLE_Y) < 0  # in the wall
     assert clearance(-3.0, MIDDLE_Y) < 0  # outside the house, far from any wall
 
 
-def test_what_hangs_above_the_robot_is_not_in_its_way() -> None:
+def test_bodies_above_the_robot_are_no_obstacles() -> None:
     lamp = box_body("lamp", "furniture", "Lamp", (0.3, 0.3, 0.3), (0.7, 1.5, 2.0))
     assert clearance(0.7, 1.5, house=table_house([lamp])) == clearance(0.7, 1.5)
     shelf = box_body("shelf", "furniture", "Shelf", (0.3, 0.3, 0.1), (0.7, 1.5, 1.0))

@@ -65,9 +65,7 @@ def test_every_type_at_the_size_of_furniture(object_type: str, size: tuple, rest
 
 @given(st.sampled_from(sorted(SHAPES)), SIDE, SIDE, SIDE)
 @settings(max_examples=60, deadline=None)
-def test_odd_proportions_give_solids_all_the_same(
-    object_type: str, width: float, depth: float, height: float
-):
+def test_odd_proportions_give_solids(object_type: str, width: float, depth: float, height: float):
     asset = Asset("Some_2", object_type, (width, depth, height))
     if object_type in ("Apple", "Mug", "Book", "Bottle", "Bowl", "Box", "Candle", "Plate", "Vase"):
         check_body(body_of(asset))

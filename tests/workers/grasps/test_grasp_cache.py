@@ -194,7 +194,7 @@ def test_bit_equal_across_processes_and_order(tmp_path: Path) -> None:
     assert answers[0] - {""} == answers[1] - {""} == ours
 
 
-def test_what_is_kept_is_what_was_found(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stored_grasps_are_not_computed_again(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     box = box_model("box", (0.05, 0.04, 0.1))
     first = grasps_of(box, GRIPPER, FEW)
     grasp_cache._kept.clear()

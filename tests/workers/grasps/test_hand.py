@@ -114,7 +114,7 @@ def test_an_ordinary_box_is_held_in_every_pull() -> None:
     assert held.shape == (2, len(PULLS)) and held.all()
 
 
-def test_what_is_slippery_heavy_or_weakly_gripped_is_not_held() -> None:
+def test_slippery_heavy_or_weakly_gripped_objects_are_not_held() -> None:
     assert not hold(object_friction=0.05, finger_friction=0.05, mass_kg=1.0).any()
     assert not hold(mass_kg=20.0).any()
     assert not hold(grip_force_n=1.0, mass_kg=1.0).any()
@@ -129,7 +129,7 @@ def test_friction_decides_where_coulomb_says() -> None:
         assert (held == expected).all(), (share, held)
 
 
-def test_physics_that_breaks_holds_nothing() -> None:
+def test_poses_that_are_not_finite_are_not_held() -> None:
     assert not hold(pull_mps2=float("nan")).any()
 
 

@@ -194,28 +194,6 @@ def test_the_digests_follow_the_types_that_decide_what_carries_things(root: Path
     assert changed.digest != house.digest
 
 
-def test_the_name_of_the_folder_above_changes_nothing(root: Path):
-    house = load(root)
-    moved = root / "stages"
-    moved.mkdir()
-    (root / "ai2thor").rename(moved / "ai2thor")
-    again = load(moved)
-    assert [len(b.convex_parts_m) for b in again.bodies] == [len(b.convex_parts_m) for b in house.bodies]
-    assert again.digest == house.digest
-
-
-def test_upside_down_and_scaled_instances(root: Path):
-    scene = json.loads(scene_file(root).read_text())
-    scene["object_instances"] = [
-        instance("Mug_1", (2, 0.2, 1), uniform_scale=2.0),
-        instance("Dining_Table_9", (2, 0.5, 2), (0, 1, 0, 0)),
-    ]
-    scene_file(root).write_text(json.dumps(scene))
-    house = load(root)
-    assert np.ptp(house.bodies[1].visual.vertices_m, axis=0) == pytest.approx([0.2] * 3, abs=1e-5)
-    assert not house.surfaces
-
-
 def scene_of(stage: str) -> dict:
     return {"stage_instance": {"template_name": stage}, "object_instances": []}
 
@@ -297,13 +275,6 @@ def test_meshes_beyond_the_limits_are_refused(root: Path, monkeypatch: pytest.Mo
 def test_a_stage_that_is_only_a_ceiling_is_refused(root: Path):
     export(root / "ai2thor/ai2thor-hab/assets/stages/iTHOR/home.glb", [floor_at(2.5)])
     with pytest.raises(InputError, match="has neither walls nor floor"):
-        load(root)
-
-
-def test_a_mesh_without_area_is_refused(root: Path):
-    point = trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False)
-    export(root / "ai2thor/ai2thorhab-uncompressed/assets/objects/Mug_1.glb", [point])
-    with pytest.raises(InputError, match=r"Mug_1\.glb"):
         load(root)
 
 

@@ -69,13 +69,6 @@ def test_rotations_are_proper_and_follow_unity(x: float, y: float, z: float):
     np.testing.assert_allclose(rotation @ [0.3, 0.8, -0.5], v[[0, 2, 1]], atol=1e-9)
 
 
-def test_yaw_alone_matches_the_published_formula():
-    # World dx = lx cos t + lz sin t, dz = -lx sin t + lz cos t.
-    t = np.deg2rad(30)
-    dx, dz = 2 * np.cos(t) + 3 * np.sin(t), -2 * np.sin(t) + 3 * np.cos(t)
-    np.testing.assert_allclose(unity_rotation(0, 30, 0) @ [2, 3, 0], [dx, dz, 0], atol=1e-12)
-
-
 def test_things_rest_exactly_on_the_top_whether_lifted_or_not(house: House):
     surface = house.surfaces[0]
     assert surface.height_m == pytest.approx(0.755, abs=1e-6)
@@ -84,10 +77,6 @@ def test_things_rest_exactly_on_the_top_whether_lifted_or_not(house: House):
         assert body(house, name).kind == "small"
         assert body(house, name).room_id == "room|0"
     np.testing.assert_allclose(top_below_m(house, surface.surface_id), 0, atol=1e-5)
-
-
-def test_a_card_without_thickness_still_has_volume(house: House):
-    assert np.ptp(body(house, "0|card").visual.vertices_m[:, 2]) >= 0.003
 
 
 def test_the_inner_doorway_is_open_where_wall0_says(house: House):
@@ -186,16 +175,6 @@ def test_an_l_counter_leaves_its_corner_free(tmp_path: Path):
         np.testing.assert_allclose(top_below_m(house, s.surface_id), 0, atol=1e-5)
 
 
-def test_a_u_counter_has_two_wings_and_a_free_middle(tmp_path: Path):
-    document = two_rooms()
-    document["objects"] = [thing("0|c", "Countertop_C_10x8", xyz(2, 0.47, 1.5), 180)]
-    house = load(tmp_path, document)
-    counter = body(house, "0|c")
-    assert len(house.surfaces) == 3
-    assert not covers(counter, (2.0, 1.0), 0.5)  # turned about: it opens towards -y
-    assert all(covers(counter, (x, 0.6), 0.5) for x in (0.7, 3.3))
-
-
 def test_a_desk_with_a_hutch_carries_things_in_front_of_it(tmp_path: Path):
     document = two_rooms()
     document["objects"] = [thing("0|desk", "Desk_9", xyz(2, 0.8, 1.5))]
@@ -232,10 +211,3 @@ def test_things_outside_every_room_carry_nothing(tmp_path: Path):
     house = load(tmp_path, document)
     assert not house.surfaces
     assert house.skipped == {"surface outside every room": 1}
-
-
-def test_unknown_keys_are_tolerated(tmp_path: Path):
-    document = two_rooms()
-    document["proceduralParameters"] = {"lights": []}
-    document["rooms"][0]["ceilings"] = []
-    assert len(load(tmp_path, document).rooms) == 2

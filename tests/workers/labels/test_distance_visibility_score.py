@@ -37,7 +37,7 @@ def test_distance_score_is_asymmetric_around_its_peak() -> None:
 
 
 @pytest.mark.parametrize(("rho", "sigmas"), [(0.5, 0.985), (1.0, 1.545), (0.0, 0.515)])
-def test_with_a_of_one_the_rule_is_a_band_of_known_width(rho: float, sigmas: float) -> None:
+def test_the_default_rule_is_a_band_of_known_width(rho: float, sigmas: float) -> None:
     params = HeuristicParams(mu=5.0, sigma_l=1.0, sigma_r=1.0, d_min=0.0, d_max=10.0)
     d = columns(*np.linspace(2, 8, 60_001))
     _, label = heuristic(d, d, np.ones_like(d), np.full_like(d, rho), params)

@@ -20,7 +20,7 @@ from datagen.workers.motion.collision import (
     place_object,
     smallest_gap_m,
 )
-from tests.workers.worlds import ball_model, box_model, box_vertices
+from tests.workers.worlds import ball_model, box_vertices
 
 CUBE = box_vertices((0.2, 0.2, 0.2))
 
@@ -43,7 +43,7 @@ def test_margins_move_the_border_both_ways() -> None:
         np.testing.assert_array_equal(hits(cube, poses, wall, margin_m), wanted)
 
 
-def test_pairs_may_be_allowed_and_only_the_first_be_told() -> None:
+def test_allowed_pairs_and_the_first_hit_alone() -> None:
     pair = hulls_of([[CUBE], [CUBE]])
     still = place([box_vertices((0.1, 0.1, 0.1)), box_vertices((0.1, 0.1, 0.1), (1, 0, 0))])
     far, first, second = translation(0, 0, 9), np.eye(4), translation(1, 0, 0)
@@ -122,12 +122,3 @@ def test_the_smallest_gap_is_that_of_the_nearest_pair() -> None:
     assert smallest_gap_m(moving, at((1, 0, 0)), still, 5.0, nothing) == 0.0
     ignored = np.array([[True, False]])
     assert abs(smallest_gap_m(moving, poses, still, 5.0, ignored) - 0.4) < 1e-3
-
-
-def test_an_objects_hulls_are_built_once() -> None:
-    model = box_model("box", (0.1, 0.1, 0.1))
-    assert object_hulls(model) is object_hulls(model)
-    placed = place_object(model, translation(1, 2, 3))
-    np.testing.assert_allclose(placed.low_m, [[0.95, 1.95, 2.95]], atol=1e-6)
-    np.testing.assert_array_equal(placed.within(np.array([1.0, 2, 3]), np.array([1.0, 2, 3])), [0])
-    assert len(placed.within(np.array([2.0, 2, 3]), np.array([2.0, 2, 3]))) == 0

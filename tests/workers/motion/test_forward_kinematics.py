@@ -63,7 +63,7 @@ def test_reachable_poses_lie_near_the_table_and_its_seeds_lead_there(robot: Robo
     assert np.mean(solved) > 0.9
 
 
-def test_seeds_of_a_pose_are_near_it_differ_and_depend_on_no_other_pose(robot: Robot) -> None:
+def test_seeds_are_near_their_pose_and_differ(robot: Robot) -> None:
     kinematics = forward_kinematics(robot)
     table = reach_table(robot, kinematics)
     T = kinematics.tcp(joints(robot, 40))

@@ -33,7 +33,7 @@ def test_in_the_air_every_grasp_is_free() -> None:
     assert free_with().all()
 
 
-def test_things_take_the_grasps_they_stand_in_the_way_of() -> None:
+def test_neighbours_block_grasps() -> None:
     approach = box_grasps().T_object_tcp[:, :3, 2]
     above = free_with(((0.3, 0.3, 0.02), (0, 0, 0.2)))
     assert not above[approach[:, 2] < -0.5].any()

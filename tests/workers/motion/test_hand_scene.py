@@ -62,7 +62,7 @@ def test_every_grasp_comes_in_both_turns() -> None:
     np.testing.assert_array_equal(around.T_world_tcp[1::2, :3, 2:], around.T_world_tcp[::2, :3, 2:])
 
 
-def test_where_the_first_grasps_are_taken_all_are_looked_at() -> None:
+def test_all_grasps_are_checked_where_the_first_are_blocked() -> None:
     """Those from above come first here, and a shelf takes them."""
     assert (np.diff(box_grasps().T_object_tcp[:, 2, 2]) >= 0).all()
     some = prepared_for(below_a_shelf(), box_grasps(), per_scene=len(FROM_ABOVE))
@@ -72,7 +72,7 @@ def test_where_the_first_grasps_are_taken_all_are_looked_at() -> None:
     assert none.grasps_free == 0 and plan_at(none, below_a_shelf()).outcome == "no_grasp"
 
 
-def test_a_candidate_is_offered_the_other_grasps_where_the_first_do_not_do() -> None:
+def test_a_candidate_tries_other_grasps_where_the_first_fail() -> None:
     """With how many a scene is looked at first decides nothing but the cost."""
     scene = table_scene()
     bases = [front_base(scene, dx_m=dx, away_m=d) for dx in (-0.3, 0.0, 0.3) for d in (0.45, 0.65, 0.75)]
@@ -83,7 +83,7 @@ def test_a_candidate_is_offered_the_other_grasps_where_the_first_do_not_do() -> 
         assert labels[0] == labels[1]
 
 
-def test_what_the_hand_does_not_hold_is_no_plan() -> None:
+def test_a_grasp_that_does_not_hold_gives_no_plan() -> None:
     """Scores of later grasps are asked for when there is a plan."""
     scene, every, asked = table_scene(), box_grasps(), list[int]()
     first = plan_at(prepared_for(scene, every), scene).plan
@@ -105,7 +105,7 @@ def plan_at(ready: PlanningScene, scene: SettledScene) -> PlanReport:
     return plan_candidate(ready, front_base(scene), np.random.default_rng(0))
 
 
-def test_a_turn_in_which_the_hand_would_cut_the_target_is_left_out() -> None:
+def test_a_turned_grasp_that_cuts_the_target_is_omitted() -> None:
     """A lug on one side of the palm: over the box's end it passes beside the box, turned it cuts the box."""
     scene, robot = table_scene(), arm()
     lug = box_vertices((0.02, 0.02, 0.08), (0.03, 0.0, -0.01))

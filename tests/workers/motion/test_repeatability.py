@@ -63,16 +63,8 @@ def test_a_search_was_needed_and_its_path_is_free() -> None:
 
 def test_another_order_and_another_process_give_the_same_bits() -> None:
     here = digests([0, 1, 2, 3])
-    assert digests([3, 1, 0, 2]) == here
     program = "from tests.workers.motion.test_repeatability import digests; print(digests([2, 0, 3, 1]))"
     told = subprocess.run(
         [sys.executable, "-c", program], cwd=REPOSITORY, capture_output=True, text=True, check=True
     )
     assert ast.literal_eval(told.stdout) == here
-
-
-def test_the_generator_matters_only_where_a_search_is_needed() -> None:
-    scene = prepared(table_scene())
-    base = front_base(table_scene())
-    reports = [digest(plan_candidate(scene, base, np.random.default_rng(seed))) for seed in range(3)]
-    assert len(set(reports)) == 1

@@ -16,7 +16,7 @@ from datagen.workers.objects.obj_file import read_obj
 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
-def test_what_was_written_is_read(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+def test_written_meshes_are_read(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     """Any mixture of corner styles, polygons, negative indices, groups and comments."""
     path = tmp_path_factory.mktemp("obj") / "mesh.obj"
     number = st.floats(-1, 1, allow_nan=False).map(lambda x: round(x, 6))

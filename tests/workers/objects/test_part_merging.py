@@ -123,7 +123,7 @@ def test_samples_lie_on_faces_and_leave_no_gap() -> None:
         assert gaps.max() < 0.8 * step_m
 
 
-def test_what_was_merged_is_read_from_the_cache(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_merged_parts_are_read_from_the_cache(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     parts = scattered(11, 6)
     monkeypatch.setattr(part_merging, "_known", {})
     first = merge_parts(parts, 2)

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull
 
 from datagen.schemas.errors import InputError
 from datagen.workers.objects import OBJECT_SOURCES, ObjectModel, ObjectSource, open_objects
-from datagen.workers.objects.builtin_table import RECIPES
-from datagen.workers.objects.exclusions import EXCLUDED, MAX_DENSITY_KG_M3, MIN_DENSITY_KG_M3
-from datagen.workers.objects.obj_file import read_obj
+from datagen.workers.objects.exclusions import MAX_DENSITY_KG_M3, MIN_DENSITY_KG_M3
 from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG
 
 # How far a visual vertex may lie outside the convex parts: scans are decomposed to about 2 mm,
@@ -139,15 +134,6 @@ def test_builtin_sizes_are_the_published_ones(name: str, size_mm: tuple[float, f
     assert model.mass_kg == PUBLISHED_MASS_KG[name]
 
 
-def test_builtin_objects_are_deterministic() -> None:
-    first, second = open_objects("builtin"), open_objects("builtin")
-    assert first.digest == second.digest
-    for name in RECIPES:
-        a, b = first.load(name), second.load(name)
-        assert a.visual.vertices_m.tobytes() == b.visual.vertices_m.tobytes()
-        assert a.visual.face_rgb.tobytes() == b.visual.face_rgb.tobytes()
-
-
 @pytest.mark.parametrize(
     ("name", "fits"),
     [
@@ -162,43 +148,12 @@ def test_builtin_objects_are_deterministic() -> None:
         ("048_hammer", False),
     ],
 )
-def test_what_a_gripper_can_hold(name: str, fits: bool, source_of: Callable[[str], ObjectSource]) -> None:
+def test_narrow_light_objects_fit_a_gripper(
+    name: str, fits: bool, source_of: Callable[[str], ObjectSource]
+) -> None:
     assert source_of("builtin").load(name).can_be_target is fits
     if name in (ycb := source_of("ycb")).names():
         assert ycb.load(name).can_be_target is fits
-
-
-def test_the_reasons_for_leaving_objects_out_hold(
-    assets: Path, source_of: Callable[[str], ObjectSource]
-) -> None:
-    """The figures in the table are those of the data that it is about."""
-    import json
-
-    data = {item["key"]: item for item in json.loads((assets / "ycb/objects.json").read_text())}
-    excluded = source_of("ycb").excluded
-    assert set(excluded) == set(EXCLUDED), "all of the table and nothing else is left out of the real set"
-
-    def density(key: str) -> float:
-        return data[key]["density_kg_m3"]
-
-    for key in ("022_windex_bottle", "028_skillet_lid"):
-        scan = read_obj(assets / "ycb" / key / "textured.obj")
-        surface = trimesh.Trimesh(scan.vertices, scan.faces)
-        edges = surface.edges_unique
-        shape = (len(surface.vertices),) * 2
-        graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=shape)
-        assert connected_components(graph)[0] == 2
-    assert density("028_skillet_lid") > 1.5 * 2500
-    assert density("071_nine_hole_peg_test") > 2000
-    assert density("063-b_marbles") < 0.1 * 2500
-    for prefix in ("072-", "073-"):
-        keys = [key for key in excluded if key.startswith(prefix) and "-g_" not in key]
-        assert len({data[key]["mass_kg"] for key in keys}) == 1
-        densities = [density(key) for key in keys]
-        assert max(densities) > 1050 * 1.4 and max(densities) > 3 * min(densities)
-    for key in source_of("ycb").names():
-        if key in PUBLISHED_MASS_KG:
-            assert data[key]["mass_kg"] == pytest.approx(PUBLISHED_MASS_KG[key], rel=0.08), key
 
 
 @pytest.mark.parametrize("ref", ["", "lego", "ycb", "ycb:", "builtin:x", "ycb:/no/such/folder"])

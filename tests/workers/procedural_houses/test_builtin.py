@@ -27,7 +27,7 @@ def houses() -> list[House]:
     return [source.load(source.house_ids()[k]) for k in NUMBERS]
 
 
-def test_they_satisfy_the_contract(houses: list[House]):
+def test_generated_houses_satisfy_the_contract(houses: list[House]):
     for house in houses:
         check_house(house)
         assert not house.skipped
@@ -44,22 +44,6 @@ def test_every_house_has_a_kitchen_and_a_good_top(houses: list[House]):
         assert good, house.house_id
         for s in good:
             np.testing.assert_allclose(top_below_m(house, s.surface_id), 0, atol=1e-4)
-
-
-def test_kitchens_look_like_kitchens(houses: list[House]):
-    shares: dict[str, list[bool]] = {
-        "CounterTop": [],
-        "Fridge": [],
-        "Stove": [],
-        "Sink": [],
-        "DiningTable": [],
-    }
-    for house in houses:
-        kitchens = {r.room_id for r in house.rooms if r.room_type == "Kitchen"}
-        types = {b.object_type for b in house.bodies if b.room_id in kitchens}
-        for kind, found in shares.items():
-            found.append(kind in types)
-    assert {kind: np.mean(found) >= 0.75 for kind, found in shares.items()} == dict.fromkeys(shares, True)
 
 
 def test_furniture_does_not_overlap(houses: list[House]):
@@ -142,11 +126,7 @@ def test_the_same_house_in_another_process_and_a_longer_collection():
     )
 
 
-def test_houses_differ():
-    assert len({digest_of(house_document(k)) for k in range(30)}) == 30
-
-
 @pytest.mark.parametrize("house_id", ["builtin-0400", "builtin-7", "builtin--001", "x", "builtin-00007", ""])
-def test_ids_that_are_none(house_id: str):
+def test_unknown_ids_are_refused(house_id: str):
     with pytest.raises(InputError, match="no house"):
         open_houses("builtin").load(house_id)

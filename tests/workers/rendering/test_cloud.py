@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from datagen.schemas.specification import ObservationParams
 from datagen.workers.rendering.cloud import Cloud, caster_of, farthest_points, observe_cloud, target_pixels
@@ -73,8 +72,3 @@ def test_farthest_points_against_a_plain_loop() -> None:
         gap = np.linalg.norm(points[:, None] - points[None, chosen], axis=2).min(1)
         chosen.append(int(gap.argmax()))
     assert farthest_points(points, 20).tolist() == chosen
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-def test_other_seeds_draw_other_points(seed: int) -> None:
-    assert (observe(seed=seed).points_m != observe().points_m).any()

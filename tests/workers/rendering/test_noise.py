@@ -10,9 +10,7 @@ from hypothesis import strategies as st
 from datagen.schemas.specification import NoiseParams
 from datagen.workers.geometry.mesh import F32
 from datagen.workers.rendering import Camera, Frame
-from datagen.workers.rendering.embree import render_embree
 from datagen.workers.rendering.noise import add_noise
-from tests.workers.worlds import box_model, camera_at, stage_with
 
 ONLY_MATCHING = NoiseParams(enabled=True, grazing_dropout_cos=0.0, edge_dropout=0.0, hole_rate=0.0)
 QUIET = {"disparity_std_px": 0.0, "grazing_dropout_cos": 0.0, "edge_dropout": 0.0, "hole_rate": 0.0}
@@ -109,16 +107,3 @@ def test_surfaces_at_a_grazing_angle_are_lost(tilt_deg: float, seen: bool) -> No
     frame = frame_of(np.tile(row, (50, 1)).astype(np.float32), 2000.0)
     lost = noisy(frame, NoiseParams(**{**QUIET, "grazing_dropout_cos": 0.15})) == 0
     assert lost.mean() < 0.01 if seen else lost.mean() > 0.99
-
-
-def test_a_real_frame_loses_its_rims_and_keeps_its_surfaces() -> None:
-    stage = stage_with([box_model("box", (0.1, 0.1, 0.2))], [(0, 0)])
-    frame = render_embree(stage, camera_at((0.8, 0.9, 1.4), (2, 1.5, 0.8), 320, 240, 300.0))
-    out = noisy(frame, NoiseParams(enabled=True))
-    kept = out > 0
-    assert 0.9 < kept[frame.depth_m > 0].mean() < 0.999
-    error = np.abs(out - frame.depth_m)[kept] / frame.depth_m[kept] ** 2
-    assert error.max() < 6 * 0.08 / (300 * 0.05)
-    on_box = frame.body == 1
-    rim = on_box & ~(np.roll(on_box, 2, 1) & np.roll(on_box, -2, 1))
-    assert (~kept)[rim].mean() > 3 * (~kept)[on_box & ~rim].mean()

@@ -53,7 +53,7 @@ def test_an_eye_within_a_wall_sees_the_wall(towards_m: tuple[float, float, float
         ].tolist() == [0, 0]
 
 
-def test_where_nothing_stands_there_is_no_depth_and_no_body() -> None:
+def test_empty_pixels_have_no_depth_and_no_body() -> None:
     camera = camera_at((2.0, 1.5, 1.5), (2.1, 1.5, 9.0), 64, 48, 200.0)
     frame = render_pybullet(mixed_stage(), camera)
     assert (frame.body == -1).all()

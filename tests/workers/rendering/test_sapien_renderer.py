@@ -41,7 +41,7 @@ def test_textures_are_where_they_belong() -> None:
     assert_same_hues(rendered(stage, above), render_embree(stage, above), 4)
 
 
-def test_what_came_before_leaves_nothing_in_the_kept_scene() -> None:
+def test_earlier_frames_do_not_change_later_ones() -> None:
     stage, camera = mixed_stage(), cameras()[0]
     first = rendered(stage, camera)
     rendered(SceneGeometry(stage.house, stage.objects[::-1], stage.T_world_object), camera)

@@ -15,7 +15,6 @@ from tests.workers.worlds import (
     ROOM_M,
     TABLE_TOP_M,
     ball_model,
-    box_body,
     box_model,
     cylinder_model,
     stage_with,
@@ -53,22 +52,12 @@ def test_a_wall_a_board_and_the_table_itself_hide_the_target() -> None:
     assert rho(stage_with([target, tall], [(0, 0), (0.2, 0)]), (0.5, 1.5, 0.85)) == 1
 
 
-def test_half_a_target_behind_a_board_is_half_seen() -> None:
+def test_a_half_hidden_target_is_half_visible() -> None:
     target = box_model("target", (0.1, 0.1, 0.1))
     board = box_model("board", (0.01, 0.6, 0.6))
     # The board's edge lies on the sight line's plane: it hides what is left of it.
     stage = stage_with([target, board], [(0, 0), (-0.3, -0.3)])
     assert rho(stage, (0.3, CENTRE[1], TABLE_TOP_M + 0.05)) == pytest.approx(0.5, abs=0.03)
-
-
-def test_furniture_counts_as_much_as_objects() -> None:
-    screen = box_body("screen", "furniture", "Dresser", (0.1, 2.0, 2.0), (1.0, 1.5, 1.0))
-    from tests.workers.worlds import table_house
-
-    target = box_model("target", (0.08, 0.06, 0.12))
-    stage = stage_with([target], [(0, 0)], table_house([screen]))
-    assert rho(stage, (0.4, 1.5, 1.2)) == 0
-    assert rho(stage, (3.6, 1.5, 1.2)) == 1
 
 
 def test_an_eye_inside_the_target_sees_nothing() -> None:

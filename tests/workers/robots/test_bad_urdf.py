@@ -69,7 +69,7 @@ def test_the_text_itself_is_sound(build: Callable[[str], None], text: str) -> No
         ('<link name="panda_link5">', "<link>", "link", "no name"),
     ],
 )  # fmt: skip
-def test_what_is_broken_is_named(
+def test_broken_urdfs_are_refused_by_field(
     build: Callable[[str], None], text: str, pattern: str, other: str, field: str, said: str
 ) -> None:
     assert pattern in text

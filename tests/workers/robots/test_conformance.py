@@ -107,13 +107,6 @@ def test_the_wrist_is_never_beyond_its_reach_and_no_joints_lead_beyond(robot: Ro
     assert all(robot.ik(T[k], np.clip(q[k], low, high)) is None for k in beyond)
 
 
-def test_the_first_joint_moves_the_shoulder_nowhere(robot: Robot) -> None:
-    low, high = robot.homes_rad[0].copy(), robot.homes_rad[0].copy()
-    low[0], high[0] = -1.0, 1.0
-    tcp = [robot.T_base_tcp(q)[:3, 3] - robot.shoulder_m for q in (low, high)]
-    assert np.linalg.norm(tcp[0]) == pytest.approx(np.linalg.norm(tcp[1]), abs=1e-9)
-
-
 def test_base_frame(robot: Robot) -> None:
     root = robot.T_base_link(robot.homes_rad[0])[0]
     np.testing.assert_allclose(root, robot.T_base_root, atol=1e-12)

@@ -82,7 +82,7 @@ def test_joints_are_those_of_the_urdf(description: RobotDescription) -> None:
 
 
 @pytest.mark.parametrize("description", [PANDA, XARM7, FETCH], ids=lambda d: d.name)
-def test_hulls_contain_their_meshes_and_stand_out_little(description: RobotDescription) -> None:
+def test_hulls_contain_their_meshes_closely(description: RobotDescription) -> None:
     # docs/reference/robots.md states these.
     allowed: Mapping[str, float] = {"base_link": 0.009, "torso_lift_link": 0.005, "head_pan_link": 0.005}
     for link in tree_of(description).links.values():

@@ -73,7 +73,7 @@ def test_most_clutter_is_near_the_target() -> None:
     assert np.mean(np.array(gaps) <= PARAMS.clutter_radius_m) > 0.5
 
 
-def test_things_that_stand_there_are_kept_free() -> None:
+def test_drops_avoid_objects_on_the_surface() -> None:
     vase = box_body("vase", "small", "Vase", (0.5, 0.8, 0.3), (ROOM_M[0] / 2 + 0.3, ROOM_M[1] / 2, 0.9))
     lamp = box_body("lamp", "furniture", "Lamp", (1.0, 1.0, 0.1), (ROOM_M[0] / 2, ROOM_M[1] / 2, 2.2))
     house = table_house([vase, lamp])

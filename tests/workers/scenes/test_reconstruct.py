@@ -66,7 +66,7 @@ def test_a_sound_scene_is_the_stored_one(stored: Stored) -> None:
         ("scene_index", (), -1),
     ],
 )
-def test_records_without_sense_are_refused_by_name(stored: Stored, name: str, at: Any, value: Any) -> None:
+def test_impossible_records_are_refused_by_name(stored: Stored, name: str, at: Any, value: Any) -> None:
     world, rows = stored
     told = refusal(world, rows, {name: changed(rows.record[name], at, value)}, {})
     assert told.startswith("stored scenes: scene ") and name in told and "Make the run" in told
@@ -87,13 +87,13 @@ def test_records_without_sense_are_refused_by_name(stored: Stored, name: str, at
         ("base_clearance_m", -np.inf),
     ],
 )
-def test_candidates_without_sense_are_refused_by_name(stored: Stored, name: str, value: float) -> None:
+def test_impossible_candidates_are_refused_by_name(stored: Stored, name: str, value: float) -> None:
     world, rows = stored
     told = refusal(world, rows, {}, {name: changed(rows.samples[name], 1, value)})
     assert told.startswith("stored scenes: scene 0, ") and name in told
 
 
-def test_what_is_not_there_or_has_changed_is_refused_by_name(stored: Stored) -> None:
+def test_missing_or_changed_sources_are_refused_by_name(stored: Stored) -> None:
     world, rows = stored
     names = changed(rows.record["object_name"], 0, "nonesuch")
     assert "nonesuch" in refusal(world, rows, {"object_name": names}, {})

@@ -43,15 +43,6 @@ def test_things_dropped_flat_rest_at_half_their_height() -> None:
     check_settled(result, tuple(models[:2]), HOUSE.surfaces[0], PARAMS)
 
 
-def test_a_scene_of_its_own_makes_the_result_independent_of_what_came_before() -> None:
-    models, poses = three_objects()
-    first = settle(models, poses)
-    settle(models[::-1], poses[::-1])
-    again = settle(models, poses)
-    np.testing.assert_array_equal(first.T_world_object, again.T_world_object)
-    assert first == first and first.steps == again.steps
-
-
 def _poses_in_a_new_process(queue: multiprocessing.Queue) -> None:  # type: ignore[type-arg]
     queue.put(settle(*three_objects()).T_world_object)
 
@@ -63,14 +54,9 @@ def test_two_processes_agree_bit_for_bit() -> None:
     process.start()
     other = queue.get(timeout=600)
     process.join()
-    np.testing.assert_array_equal(settle(*three_objects()).T_world_object, other)
-
-
-def test_mass_and_inertia_are_those_of_the_model() -> None:
-    # Twice the mass under the same forces falls alike: only the contacts can tell, and at rest no more.
-    light, heavy = (box_model("b", (0.1, 0.1, 0.1), mass_kg=m) for m in (0.1, 5.0))
-    a, b = (settle([m], [on_table(m, 0, 0, 0.01)]) for m in (light, heavy))
-    np.testing.assert_allclose(a.T_world_object, b.T_world_object, atol=1e-3)
+    models, poses = three_objects()
+    settle(models[::-1], poses[::-1])  # earlier calls change nothing
+    np.testing.assert_array_equal(settle(models, poses).T_world_object, other)
 
 
 def cause_of(result: SettleResult, models: list[ObjectModel]) -> str:
@@ -79,12 +65,12 @@ def cause_of(result: SettleResult, models: list[ObjectModel]) -> str:
     return caught.value.cause
 
 
-def test_what_rolls_off_or_starts_beside_the_table_fell_off() -> None:
+def test_an_object_dropped_beside_the_table_fell_off() -> None:
     box = box_model("box", (0.1, 0.1, 0.1))
     assert cause_of(settle([box], [on_table(box, 0.68, 0.0, 0.01)]), [box]) == "fell_off"
 
 
-def test_what_still_moves_after_the_last_step_is_not_at_rest() -> None:
+def test_an_object_that_moves_after_the_last_step_is_not_at_rest() -> None:
     ball = ball_model("ball", 0.04)
     result = settle([ball], [on_table(ball, 0, 0, 0.5)], max_steps=20)
     assert result.steps == 20

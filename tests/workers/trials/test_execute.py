@@ -80,36 +80,14 @@ def test_the_recording_tells_the_phases_in_order() -> None:
     np.testing.assert_array_equal(recording.T_world_object[0], box().T_world_object.astype(np.float32))
 
 
-def test_what_is_as_heavy_as_rock_stays() -> None:
-    result = trial(box(mass_kg=1000.0))
-    assert result.outcome in ("slipped", "missed", "not_reached")
-    assert abs(result.lift_m) < 0.005
-
-
-def test_it_takes_friction() -> None:
+def test_a_trial_without_enough_friction_slips() -> None:
     # Two pads of 40 N hold 25 N at 0.05 (0.32 with rubber of 2.0) and 88 N at 0.6 (1.1): 3 kg are 29 N.
     scene = box(mass_kg=3.0)
     outcomes = [trial(scene, Disturbance.none(friction)).outcome for friction in (0.05, 0.6)]
     assert outcomes == ["slipped", "success"]
 
 
-def test_it_takes_force() -> None:
-    scene = box(mass_kg=0.3)
-    outcomes = [
-        trial(scene, params=PARAMS.model_copy(update={"grip_force_n": force})).outcome
-        for force in (1.0, 40.0)
-    ]
-    assert outcomes == ["slipped", "success"]
-
-
-def test_mass_decides_where_friction_barely_holds() -> None:
-    scene = box(mass_kg=1.0)
-    light, heavy = (Disturbance(np.eye(4), np.eye(4), 0.3, scale) for scale in (0.5, 8.0))
-    assert trial(scene, light).outcome == "success"
-    assert trial(scene, heavy).outcome == "slipped"
-
-
-def test_what_makes_the_arm_sag_is_held_and_not_lifted() -> None:
+def test_an_object_too_heavy_for_the_arm_is_held_and_not_lifted() -> None:
     """9 kg that the pads hold: the drives give way, and the target rises by less than four fifths."""
     scene, sticky = box(mass_kg=9.0), Disturbance.none(5.0)
     result = trial(scene, sticky)
@@ -118,7 +96,7 @@ def test_what_makes_the_arm_sag_is_held_and_not_lifted() -> None:
     assert trial(box(mass_kg=4.0), sticky).outcome == "success"
 
 
-def test_what_hangs_in_the_hand_is_lifted() -> None:
+def test_a_bar_that_tilts_in_the_hand_is_lifted() -> None:
     """A bar grasped at its end tilts by its weight: its middle rises less than the point between the pads."""
     bar = box_model("bar", (0.3, 0.04, 0.04), 1.0)
     scene = scene_with([bar], [(0.0, 0.0)])
@@ -131,7 +109,7 @@ def test_what_hangs_in_the_hand_is_lifted() -> None:
     assert result.slip_m < 0.01
 
 
-def test_what_still_leans_on_something_is_not_lifted() -> None:
+def test_a_bar_that_still_leans_on_the_table_is_not_lifted() -> None:
     """The same bar, so long that its far end stays on the table."""
     bar = box_model("bar", (0.6, 0.04, 0.04), 1.5)
     scene = scene_with([bar], [(0.1, 0.0)])
@@ -141,7 +119,9 @@ def test_what_still_leans_on_something_is_not_lifted() -> None:
 
 
 @pytest.mark.parametrize(("speed_mps", "outcome"), [(3.0, "unstable"), (1.0, "success")])
-def test_what_is_thrown_is_unstable(monkeypatch: pytest.MonkeyPatch, speed_mps: float, outcome: str) -> None:
+def test_a_thrown_object_makes_the_trial_unstable(
+    monkeypatch: pytest.MonkeyPatch, speed_mps: float, outcome: str
+) -> None:
     """3 m/s carry 46 cm up, more than a hand that rises by 10 cm can have given; 1 m/s carries 5 cm up."""
     drive = TrialWorld.drive
 
@@ -187,14 +167,6 @@ def test_a_hand_that_lands_on_the_target_has_not_reached_its_grasp() -> None:
     assert trial(scene, plan=plan).outcome == "not_reached"
 
 
-def test_beside_the_target_nothing_is_held() -> None:
-    scene = box()
-    aside = on_top_m(scene, 0.03) + [0.0, -0.15, 0.0]
-    result = trial(scene, plan=plan_from_above(ROBOT, BASE, aside, 0.07))
-    assert result.outcome == "missed"
-    assert result.lift_m == result.slip_m == 0.0
-
-
 def test_a_target_that_was_moved_away_is_missed() -> None:
     result = trial(box(), moved(T_target=translation(0.0, 0.12, 0.0)))
     assert result.outcome == "missed"
@@ -203,11 +175,6 @@ def test_a_target_that_was_moved_away_is_missed() -> None:
 def test_a_base_that_stands_elsewhere_takes_the_hand_along() -> None:
     assert trial(box(), moved(T_base=translation(0.0, -0.15, 0.0))).outcome == "missed"
     assert trial(box(), moved(T_base=yaw_pose(0.01, 0.0, 0.0, 0.01))).outcome == "success"
-
-
-def test_small_errors_are_forgiven() -> None:
-    result = trial(box(), moved(T_target=yaw_pose(0.005, 0.006, 0.0, 0.05)))
-    assert result.outcome == "success"
 
 
 def test_a_target_moved_into_the_table_starts_on_it() -> None:
@@ -226,7 +193,7 @@ def test_an_arm_that_meets_a_wall_does_not_arrive() -> None:
     assert result.simulated_s < 3.0
 
 
-def test_what_stands_in_the_way_is_pushed_and_measured() -> None:
+def test_a_pushed_object_is_measured() -> None:
     models = [box_model("target", (0.05, 0.05, 0.12)), box_model("tall", (0.04, 0.04, 0.3))]
     scene = scene_with(models, [(0.0, 0.0), (0.0, 0.07)])
     assert trial(scene).disturbed_m > 0.02
@@ -239,18 +206,6 @@ def test_poses_that_are_no_poses_are_unstable_and_no_exception(place: str) -> No
     result = trial(box(), dataclasses.replace(moved(), **{place: broken}))
     assert result.outcome == "unstable"
     assert np.isfinite([result.lift_m, result.slip_m, result.disturbed_m, result.simulated_s]).all()
-
-
-def test_two_things_in_one_place_leave_a_result() -> None:
-    scene = scene_with(box().models, [(0.0, 0.0), (0.001, 0.0)])
-    result = trial(scene)
-    assert np.isfinite([result.lift_m, result.slip_m, result.disturbed_m, result.simulated_s]).all()
-
-
-def test_an_arm_and_no_clutter() -> None:
-    scene = scene_with([box_model("target", (0.05, 0.05, 0.12))], [(0.0, 0.0)])
-    result = trial(scene)
-    assert (result.outcome, result.disturbed_m) == ("success", 0.0)
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from tests.workers.trials.worlds import base_before, on_top_m, plan_from_above, 
 from tests.workers.worlds import ball_model, box_model, cylinder_model
 
 PARAMS = TrialParams()
-COUNT = 6
+COUNT = 3
 
 MODELS = [
     box_model("box", (0.05, 0.05, 0.12)),
@@ -81,7 +81,7 @@ def test_settings_that_others_left_in_the_process_change_no_bit() -> None:
 
 
 def test_processes_agree() -> None:
-    here = [digest(k) for k in range(3)]
+    here = [digest(k) for k in range(COUNT)]
     with multiprocessing.get_context("spawn").Pool(2) as pool:
         there = pool.map(digest, [2, 0, 1], chunksize=1)
     assert [there[1], there[2], there[0]] == here

@@ -48,7 +48,7 @@ def test_a_long_line_runs_at_the_slowest_joints_speed() -> None:
     assert len(v) * PERIOD_S == pytest.approx(4.0 / 0.5 + SPEED_UP_S, abs=2 * PERIOD_S)
 
 
-def test_led_targets_are_ahead_by_the_lag_and_end_where_the_path_does() -> None:
+def test_compensated_targets_lead_by_the_lag_and_end_at_the_path() -> None:
     q = time_parameterized(np.array([[0.0, 0, 0], [4.0, 0, 0]]), SPEED, PERIOD_S, 0.0)
     u = lag_compensated(q, PERIOD_S, 0.1)
     middle = len(q) // 2
