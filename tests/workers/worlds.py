@@ -147,7 +147,7 @@ def table_house(furniture: Sequence[StaticBody] = ()) -> House:
     return House(
         "table-house",
         "ab" * 32,
-        (Room("room|1", "Kitchen", polygon_m, 2.5),),
+        (Room("room|1", "Kitchen", polygon_m),),
         (floor, *walls, table, *furniture),
         (surface,),
     )

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, cast
@@ -103,13 +103,11 @@ class Ai2thorHouses:
         mesh = _without_ceiling(stage.mesh.transformed(_in_world(turn)))
         if not len(mesh.faces):
             raise scene.get("stage_instance").error("has neither walls nor floor", _FIX)
-        skipped: Counter[str] = Counter()
         placed: list[tuple[StaticBody, F64, F64, Mesh]] = []
         for number, entry in enumerate(scene.get("object_instances").items(_MAX_OBJECTS)):
             name = _template_name(entry)
             file = self.root / _OBJECTS / f"{name}.glb"
             if not file.is_file():
-                skipped["missing mesh"] += 1
                 continue
             template = self._template(file)
             digest.update(template.digest)
@@ -123,9 +121,7 @@ class Ai2thorHouses:
             bodies.append(replace(body, room_id=owner))
             if owner and body.object_type in CARRYING_TYPES:
                 surfaces.extend(_surfaces(body, owner, T, local))
-        return House(
-            house_id, digest.hexdigest(), tuple(rooms), tuple(bodies), tuple(surfaces), dict(skipped)
-        )
+        return House(house_id, digest.hexdigest(), tuple(rooms), tuple(bodies), tuple(surfaces))
 
     def _template(self, file: Path) -> _Template:
         if file in self._templates:
@@ -269,7 +265,6 @@ def _walls_and_rooms(
     """The stage as a body, and a room for every patch of floor."""
     normals, _ = normals_and_areas(stage)
     corner_z = stage.vertices_m[stage.faces][:, :, 2]
-    ceiling_m = float(stage.vertices_m[:, 2].max())
     is_floor = (normals[:, 2] > 0.97) & (np.abs(corner_z).max(1) < 0.05)
     polygons: list[F64] = []
     for outline in outlines(stage, is_floor):
@@ -279,7 +274,7 @@ def _walls_and_rooms(
     if not polygons:  # the stage has no floor: use the ground below the walls
         low, high = stage.vertices_m.min(0)[:2], stage.vertices_m.max(0)[:2]
         polygons = [np.array([low, (high[0], low[1]), high, (low[0], high[1])], np.float64)]
-    plain = [Room(f"room|{k}", "Room", p, ceiling_m) for k, p in enumerate(polygons)]
+    plain = [Room(f"room|{k}", "Room", p) for k, p in enumerate(polygons)]
     owners = room_ids_at(np.array([xy for _, xy in things]).reshape(-1, 2), plain)
     within: dict[str, set[str]] = {r.room_id: set() for r in plain}
     for (body, _), owner in zip(things, owners, strict=True):

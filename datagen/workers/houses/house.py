@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, Protocol
 
 from datagen.workers.geometry.mesh import F32, F64, Mesh
@@ -18,7 +17,6 @@ class Room:
     room_id: str
     room_type: str  # Kitchen, LivingRoom, Bedroom, Bathroom, ...
     polygon_m: F64  # (K, 2)
-    ceiling_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +57,13 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class House:
-    """Static surroundings of a scene. `skipped` counts the entries that the loader left out, by cause."""
+    """Static surroundings of a scene."""
 
     house_id: str
     digest: str  # sha256 of the house's own bytes in its source
     rooms: tuple[Room, ...]
     bodies: tuple[StaticBody, ...]
     surfaces: tuple[Surface, ...]
-    skipped: Mapping[str, int] = field(default_factory=dict)
 
     def room(self, room_id: str) -> Room:
         return next(r for r in self.rooms if r.room_id == room_id)

@@ -8,7 +8,6 @@ the simulator of the files.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -42,24 +41,20 @@ MAX_ROOMS = 200
 MAX_WALLS = 2000
 MAX_HOLES = 1000
 _MAX_HEIGHT_M = 30.0
-_DEFAULT_CEILING_M = 2.5
 
 
 def build_house(root: JsonNode, house_id: str, digest: str, assets: Mapping[str, Asset]) -> House:
     """The house of one document. Raises InputError that names the house and the JSON path."""
-    skipped: Counter[str] = Counter()
-    walls, room_heights = _walls(root.get("walls"), skipped)
-    rooms, floors = _rooms(root.get("rooms"), room_heights)
+    walls = _walls(root.get("walls"))
+    rooms, floors = _rooms(root.get("rooms"))
     holes = [*_holes(root.find("doors"), walls, True), *_holes(root.find("windows"), walls, False)]
-    furniture, surfaces = object_bodies(root.get("objects"), assets, skipped)
+    furniture, surfaces = object_bodies(root.get("objects"), assets)
     owners = room_ids_at(np.array([xy for _, xy in furniture]).reshape(-1, 2), rooms)
     owner_of = {body.body_id: owner for (body, _), owner in zip(furniture, owners, strict=True)}
     bodies = [replace(b, room_id=owner_of[b.body_id]) for b, _ in furniture]
     usable = [replace(s, room_id=owner_of[s.body_id]) for s in surfaces if owner_of[s.body_id]]
-    if len(usable) < len(surfaces):
-        skipped["surface outside every room"] = len(surfaces) - len(usable)
     everything = (*floors, *wall_bodies(list(walls.values()), holes), *bodies)
-    return House(house_id, digest, tuple(rooms), everything, tuple(usable), dict(skipped))
+    return House(house_id, digest, tuple(rooms), everything, tuple(usable))
 
 
 def room_ids_at(points_m: F64, rooms: list[Room]) -> list[str]:
@@ -71,7 +66,7 @@ def room_ids_at(points_m: F64, rooms: list[Room]) -> list[str]:
     return owners
 
 
-def _rooms(node: JsonNode, heights: Mapping[str, float]) -> tuple[list[Room], list[StaticBody]]:
+def _rooms(node: JsonNode) -> tuple[list[Room], list[StaticBody]]:
     rooms: list[Room] = []
     floors: list[StaticBody] = []
     seen: set[str] = set()
@@ -85,8 +80,7 @@ def _rooms(node: JsonNode, heights: Mapping[str, float]) -> tuple[list[Room], li
         polygon_m = clean_polygon(corners)
         if isinstance(polygon_m, str):
             raise outline.error(f"the floor has {polygon_m}")
-        ceiling_m = heights.get(room_id, max(heights.values(), default=_DEFAULT_CEILING_M))
-        rooms.append(Room(room_id, entry.get("roomType").text(), polygon_m, ceiling_m))
+        rooms.append(Room(room_id, entry.get("roomType").text(), polygon_m))
         mesh, parts_m = join(floor_solids(polygon_m, material_rgb(entry.find("floorMaterial"), True)))
         floors.append(StaticBody(f"floor-{room_id}", "wall", "Floor", "", room_id, mesh, parts_m))
     if not rooms:
@@ -94,18 +88,16 @@ def _rooms(node: JsonNode, heights: Mapping[str, float]) -> tuple[list[Room], li
     return rooms, floors
 
 
-def _walls(node: JsonNode, skipped: Counter[str]) -> tuple[dict[str, WallSegment], dict[str, float]]:
-    """Walls by id and the height of the walls of each room."""
+def _walls(node: JsonNode) -> dict[str, WallSegment]:
+    """Walls by id."""
     walls: dict[str, WallSegment] = {}
-    heights: dict[str, float] = {}
     for entry in node.items(MAX_WALLS):
         wall_id = entry.get("id").text()
         if wall_id in walls:
             raise entry.get("id").error(f"belongs to two walls: {wall_id!r}")
         empty = entry.find("empty")
         if empty is not None and empty.value is True:
-            skipped["open wall"] += 1  # a passage between two rooms, listed as a wall
-            continue
+            continue  # a passage between two rooms, listed as a wall
         outline = entry.get("polygon")
         points = [p.point() for p in outline.items(16)]
         if len(points) != 4:
@@ -115,14 +107,10 @@ def _walls(node: JsonNode, skipped: Counter[str]) -> tuple[dict[str, WallSegment
         if not 0.1 <= height_m <= _MAX_HEIGHT_M:
             raise outline.error(f"a wall {height_m:g} m high")
         if np.hypot(end[0] - start[0], end[1] - start[1]) < 1e-3:
-            skipped["wall without length"] += 1
             continue
         rgb = material_rgb(entry.find("material"), False)
         walls[wall_id] = WallSegment(wall_id, start, end, height_m, rgb)
-        room = entry.find("roomId")
-        if room is not None:
-            heights[room.text()] = max(height_m, heights.get(room.text(), 0.0))
-    return walls, heights
+    return walls
 
 
 def _holes(node: JsonNode | None, walls: Mapping[str, WallSegment], is_door: bool) -> list[Hole]:
@@ -181,7 +169,7 @@ _SWAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 
 def object_bodies(
-    node: JsonNode, assets: Mapping[str, Asset], skipped: Counter[str]
+    node: JsonNode, assets: Mapping[str, Asset]
 ) -> tuple[list[tuple[StaticBody, F64]], list[Surface]]:
     """Bodies, each with the point (2,) that decides its room, and support surfaces.
 
@@ -193,10 +181,7 @@ def object_bodies(
     for entry in node.items(MAX_OBJECTS):
         asset = assets.get(entry.get("assetId").text())
         if asset is None:
-            skipped["unknown asset"] += 1
-            # Objects on it would float.
-            skipped["on an unknown asset"] += sum(1 for _ in _children(entry))
-            continue
+            continue  # with the objects on it, which would float
         T_asset, tilt_deg = _pose(entry, asset)
         xy = _centre_xy(entry)
         body = _body(entry, asset, T_asset, "furniture", seen)
@@ -205,14 +190,9 @@ def object_bodies(
             surfaces.extend(_surfaces(body.body_id, asset, T_asset))
         for child in _children(entry):
             small = assets.get(child.get("assetId").text())
-            if small is None:
-                skipped["unknown asset"] += 1
+            if small is None or _is_inside(child, asset, T_asset):
                 continue
-            T, _ = _pose(child, small)
-            if _is_inside(child, asset, T_asset):
-                skipped["hidden inside furniture"] += 1
-                continue
-            T = _rested(T, small, asset, T_asset)
+            T = _rested(_pose(child, small)[0], small, asset, T_asset)
             out.append((_body(child, small, T, "small", seen), xy))
     return out, surfaces
 

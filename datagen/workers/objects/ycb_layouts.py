@@ -59,7 +59,6 @@ class Entry:
     """One object of a folder: its files and its mass, or a density if the mass is unknown."""
 
     name: str
-    place: str  # named in messages: "<index file>: [12]"
     files: ScanFiles
     mass_kg: float | None
     density_kg_m3: float
@@ -101,7 +100,7 @@ def _bundle(folder: Path, index: Path) -> list[Entry]:
             _inside(folder, index, f"{field}.files.texture", item.files.texture),
             _inside(folder, index, f"{field}.files.collision", item.files.collision),
         )
-        entries[item.key] = Entry(item.key, f"{index}: {field}", files, item.mass_kg, 0.0)
+        entries[item.key] = Entry(item.key, files, item.mass_kg, 0.0)
     return [entries[name] for name in sorted(entries)]
 
 
@@ -123,7 +122,7 @@ def _maniskill(folder: Path, index: Path) -> list[Entry]:
                 home, "", "neither collision.ply nor collision.obj is here", "Fetch the asset again"
             )
         files = scan_files(visual, _inside(home, library, "map_Kd", image), collision)
-        entries.append(Entry(name, f"{index}: {name}", files, PUBLISHED_MASS_KG.get(name), model.density))
+        entries.append(Entry(name, files, PUBLISHED_MASS_KG.get(name), model.density))
     return entries
 
 

@@ -17,8 +17,8 @@ from datagen.workers.registry import can_import, entry
 class SettleResult:
     """Final poses of the objects and their motion at the end.
 
-    `penetration_m` is the depth of the deepest contact at the end, `residual_*` the largest
-    speeds then. `at_rest` is True if they stayed below the limits for `rest_steps` steps.
+    `penetration_m` is the depth of the deepest contact at the end, `residual_speed_mps` the largest
+    speed then. `at_rest` is True if they stayed below the limits for `rest_steps` steps.
     Poses may hold NaN if the physics became unstable; callers must check.
     """
 
@@ -26,7 +26,6 @@ class SettleResult:
     steps: int
     at_rest: bool
     residual_speed_mps: float
-    residual_angular_radps: float
     penetration_m: float
 
 

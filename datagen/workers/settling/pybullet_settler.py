@@ -43,7 +43,7 @@ def settle_pybullet(
             bodies, T_object_inertial = _fill(
                 world, Path(folder), static_parts_m, objects, T_world_object, params
             )
-        steps, at_rest, speed, angular = _fall(world, bodies, params)
+        steps, at_rest, speed = _fall(world, bodies, params)
         final = [
             _pose_of(world, body) @ inverse(T) for body, T in zip(bodies, T_object_inertial, strict=True)
         ]
@@ -52,7 +52,6 @@ def settle_pybullet(
             steps=steps,
             at_rest=at_rest,
             residual_speed_mps=speed,
-            residual_angular_radps=angular,
             penetration_m=_deepest_contact(world),
         )
     finally:
@@ -136,8 +135,8 @@ def _hulls_as_obj(parts_m: Sequence[F32]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _fall(world: int, bodies: list[int], params: SettleParams) -> tuple[int, bool, float, float]:
-    """Step until rest; returns steps, whether at rest, and the largest speeds at the end (m/s, rad/s)."""
+def _fall(world: int, bodies: list[int], params: SettleParams) -> tuple[int, bool, float]:
+    """Step until rest; returns steps, whether at rest, and the largest speed at the end (m/s)."""
     steps, resting = 0, 0
     speed = angular = np.inf
     while steps < params.max_steps and resting < params.rest_steps:
@@ -153,7 +152,7 @@ def _fall(world: int, bodies: list[int], params: SettleParams) -> tuple[int, boo
             break
         calm = speed < params.rest_speed_mps and angular < params.rest_angular_speed_radps
         resting = resting + _CHECK_EVERY if calm else 0
-    return steps, resting >= params.rest_steps, speed, angular
+    return steps, resting >= params.rest_steps, speed
 
 
 def _pose_of(world: int, body: int) -> F64:

@@ -61,7 +61,6 @@ def settle_sapien(
         steps=steps,
         at_rest=resting >= params.rest_steps,
         residual_speed_mps=speed,
-        residual_angular_radps=angular,
         penetration_m=_deepest_contact(scene),
     )
 

@@ -80,7 +80,7 @@ def test_an_object_that_moves_after_the_last_step_is_not_at_rest() -> None:
 def test_penetration_and_nan_are_named() -> None:
     box = box_model("box", (0.1, 0.1, 0.1))
     good = settle([box], [on_table(box, 0, 0, 0.005)])
-    deep = SettleResult(good.T_world_object, 10, True, 0.0, 0.0, 0.02)
+    deep = SettleResult(good.T_world_object, 10, True, 0.0, 0.02)
     assert cause_of(deep, [box]) == "penetration"
-    broken = SettleResult(good.T_world_object * np.nan, 10, False, np.nan, np.nan, 0.0)
+    broken = SettleResult(good.T_world_object * np.nan, 10, False, np.nan, 0.0)
     assert cause_of(broken, [box]) == "not_finite"
