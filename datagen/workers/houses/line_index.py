@@ -25,7 +25,7 @@ from datagen.workers.content_cache import cache_folder, drop_unused, refresh
 from datagen.workers.json_document import parse_json
 
 MAX_LINE_BYTES = 16 << 20  # the largest known house has 0.1 MB
-MAX_LINES = 500_000  # fifty times the known sets; each needs a kilobyte of memory
+MAX_LINES = 100_000  # eight times the known sets; each needs a kilobyte of memory
 _MAX_FILE_BYTES = 64 << 30
 # Houses compress to a twentieth of their size; a file that unpacks to far more is a decompression bomb.
 _MAX_UNPACKED_BYTES, _MAX_RATIO = 256 << 20, 100

@@ -89,6 +89,7 @@ class HandScene:
     """
 
     hand: Hand
+    T_world_target: F64  # (4, 4)
     static: Placed  # convex parts of the house around the target
     near: Placed  # those that the hand can touch, and the other objects
     floor: Bools  # which static parts are low enough for a base to stand on
@@ -194,6 +195,7 @@ def hand_scene(
         kept, rest = rest[is_free(rest)], rest[:0]
     return HandScene(
         hand,
+        T_world_target,
         static,
         around,
         floor,
