@@ -27,13 +27,14 @@ def main() -> None:
     options = parser.parse_args()
     started_s = time.process_time()
     import numpy as np
+    import torch
 
     from datagen.train.models import build_model
     from datagen.train.prediction import RobotSize, load_scorer, predict, read_footprint, read_place
-    from datagen.train.scorers import ModelScorer, use_threads
+    from datagen.train.scorers import ModelScorer
 
     imported_s = time.process_time()
-    use_threads(1)
+    torch.set_num_threads(1)
     scorer = (
         load_scorer(options.checkpoint)
         if options.checkpoint

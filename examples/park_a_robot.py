@@ -3,7 +3,7 @@
 Usage: python examples/park_a_robot.py [FOLDER]   (after examples/train_on_labels.py [FOLDER])
 
 The camera here is a stored view of FOLDER/val. On a robot fill the same SensorFrame with points of the depth
-camera, a mask of the target, and the camera's pose in the map; or name files (.npz, .ply, PNG) instead.
+camera, a mask of the target, and the camera's pose in the map; or name a folder or .npz file instead.
 """
 
 import math

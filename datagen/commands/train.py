@@ -6,12 +6,11 @@ import os
 import sys
 import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, fields
+from dataclasses import KW_ONLY, asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
 
 from cyclopts import Parameter
-from pydantic import TypeAdapter, ValidationError
 
 from datagen.configuration.toml_files import read_toml
 from datagen.console.command_lines import Interrupted, interruptible, options_of, print_interrupted, prints
@@ -92,7 +91,7 @@ class TrainOptions:
         house_share: Share of the houses to train on, for learning curves.
         lr: Highest learning rate. [default: 0.002; 0.001 in stage2]
         seed: Seed of weights, order and dropout.
-        augment: noise, holes, dropout, colour, rotation, comma-separated; or a TOML file.
+        augment: Effects, comma-separated: noise, holes, dropout, colour, rotation.
         encoded: Folder for encoded inputs of `shared`: written once, read by later trainings.
         device: Device of the model.
         threads: Threads. [default: all cores]
@@ -219,28 +218,17 @@ def model_sizes(words: Sequence[str]) -> dict[str, Any]:
 
 
 def read_augmentation(word: str | None) -> tuple[Augmentation | None, dict[str, Any]]:
-    """Read `--augment`, names of effects or a TOML file; return it also as plain data."""
+    """Read `--augment`, names of effects with their default numbers; return it also as plain data."""
     if word is None:
         return None, {}
     from datagen.train.augment import Augmentation
 
     kinds = {name: get_args(kind)[0] for name, kind in get_type_hints(Augmentation).items()}
-    sections: dict[str, Any] = {name.strip(): {} for name in word.split(",")}
-    if word.endswith(".toml"):
-        sections = read_toml(Path(word), _FIX)
-    effects: dict[str, Any] = {}
-    for name, values in sections.items():
+    names = [name.strip() for name in word.split(",")]
+    for name in names:
         if name not in kinds:
             raise InputError("--augment", name, "is not an effect", choices(kinds, name))
-        known = {f.name for f in fields(kinds[name])}
-        if not isinstance(values, dict) or not values.keys() <= known:
-            raise InputError("--augment", name, "is not a section of the file", choices(known, name))
-        try:
-            effects[name] = TypeAdapter(kinds[name]).validate_python(values)
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(map(str, (name, *first["loc"])))
-            raise InputError("--augment", where, first["msg"].lower(), _FIX) from None
+    effects = {name: kinds[name]() for name in names}
     return Augmentation(**effects), {name: asdict(effect) for name, effect in effects.items()}
 
 

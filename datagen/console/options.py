@@ -16,7 +16,6 @@ from cyclopts import Group, Parameter, Token
 
 from datagen.schemas.errors import InputError
 
-_MOST_RESAMPLES = 10_000
 _NUMBER = re.compile(r"[+-]?([0-9]{1,30}|[0-9]{1,3}(,[0-9]{3}){1,9})((\.[0-9]{1,30})?[eE]\+?[0-9]{1,2})?")
 
 
@@ -50,15 +49,6 @@ PathsOrAddresses = Annotated[Sequence[str | Path], Parameter(metavar="STR...")]
 File = Annotated[str | Path, Parameter(metavar="PATH")]
 AllowIncomplete = Annotated[bool, Parameter(help="Accept runs that lack planned samples instead of failing.")]
 AsJson = Annotated[bool, Parameter(help="Print one JSON document to standard output.")]
-
-
-def refuse_odd_draws(bootstrap: int, seed: int) -> None:
-    """Raise InputError for a number of resamples or a seed that is out of range."""
-    if not 1 <= bootstrap <= _MOST_RESAMPLES:
-        fix = "Give another number; 1000 is usual"
-        raise InputError("--bootstrap", str(bootstrap), f"is not between 1 and {_MOST_RESAMPLES}", fix)
-    if seed < 0:
-        raise InputError("--seed", str(seed), "is below 0", "Give 0 or more")
 
 
 def refuse_output(file: Path, option: str, *endings: str) -> None:

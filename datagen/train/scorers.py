@@ -83,10 +83,3 @@ def weights_sha256(model: Model) -> str:
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()
-
-
-def use_threads(n: int) -> None:
-    """Let torch compute on n threads from now on, in all of this process."""
-    import torch
-
-    torch.set_num_threads(n)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from datagen.train.models.model import Model, fast
+from datagen.train.models.model import Model
 from datagen.train.models.n2m import N2mModel
 from datagen.train.models.paper import PaperModel
 from datagen.train.models.shared import SharedModel
@@ -28,4 +28,4 @@ def build_model(name: str, config: Mapping[str, Any]) -> Model:
     return build(config)
 
 
-__all__ = ["MODELS", "Model", "build_model", "fast"]
+__all__ = ["MODELS", "Model", "build_model"]

@@ -29,8 +29,6 @@ class Model(nn.Module, ABC):
     """
 
     name: ClassVar[str]
-    # Methods on tensors alone that take most of the time: `fast` compiles them.
-    hot: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
@@ -46,7 +44,7 @@ class Model(nn.Module, ABC):
     def forward(
         self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
     ) -> Tensor:
-        """As `score`; wrappers of modules (DistributedDataParallel, torch.compile) call it."""
+        """As `score`; wrappers of modules, as of torch.compile, call it."""
 
     @property
     def logit_layer(self) -> nn.Module | None:
@@ -68,27 +66,6 @@ class Model(nn.Module, ABC):
     def device(self) -> torch.device:
         """Device of the parameters."""
         return next(self.parameters()).device
-
-
-def fast(model: Model) -> Model:
-    """The same model, on CUDA with its hot methods compiled and matrix products in bfloat16.
-
-    On a CPU it is returned unchanged. Parameters and checkpoints are the same.
-    """
-    if model.device.type != "cuda":
-        return model
-    for method in model.hot:
-        setattr(model, method, torch.compile(getattr(model, method), dynamic=True))
-    plain = model.forward
-
-    def mixed(
-        clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
-    ) -> Tensor:
-        with torch.autocast("cuda", dtype=torch.bfloat16):
-            return plain(clouds, candidates, robots).float()
-
-    model.forward = mixed
-    return model
 
 
 def read_config(kind: type[ConfigT], name: str, config: Mapping[str, Any]) -> ConfigT:

@@ -95,7 +95,6 @@ class PaperModel(Model):
     """
 
     name = "paper"
-    hot = ("_abstract",)
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         self.sizes = read_config(PaperConfig, self.name, config)

@@ -102,7 +102,6 @@ class SharedModel(Model):
     """Tokens of a robot's cloud in each candidate's frame."""
 
     name = "shared"
-    hot = ("_pool",)
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         self.sizes = read_config(SharedConfig, self.name, config)

@@ -55,7 +55,6 @@ class BaseCells:
 
     offset_m: F32  # (N, 2), from the target's centre, world axes
     state: I64  # (N,), index into STATES
-    floor_seen: F64  # (N,), share of the floor under the base that was seen
     way: I64  # (N,), index into WAYS: how the base gets there from the camera
 
 
@@ -103,7 +102,7 @@ def observe_cells(
     state[(share >= SEEN_SHARE) & (way == WAYS.index("seen"))] = STATES.index(CLEAR)
     state[way == WAYS.index("none")] = STATES.index(UNREACHABLE)
     state[blocked] = STATES.index(BLOCKED)
-    return BaseCells(offsets.astype(np.float32), state, share, way)
+    return BaseCells(offsets.astype(np.float32), state, way)
 
 
 def seen_share(cloud_m: F32, radius_m: float) -> float:

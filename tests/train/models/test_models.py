@@ -11,7 +11,7 @@ import torch
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import CandidateInputs
-from datagen.train.models import MODELS, build_model, fast
+from datagen.train.models import MODELS, build_model
 from tests.train.models.made_batches import drawn_tables, small_model
 
 NAMES = sorted(MODELS)
@@ -115,16 +115,6 @@ def test_an_invalid_configuration_names_its_field(name: str, config: dict[str, A
     with pytest.raises(InputError) as error:
         build_model(name, config)
     assert words in str(error.value)
-
-
-@pytest.mark.parametrize("name", NAMES)
-@torch.no_grad()
-def test_on_a_cpu_fast_changes_nothing(name: str):
-    model = small_model(name)
-    logits = model.score(*drawn_tables(0))
-    same = fast(model)
-    assert same is model
-    assert torch.equal(same.score(*drawn_tables(0)), logits)
 
 
 @pytest.mark.parametrize("name", NAMES)
