@@ -71,7 +71,7 @@ def page() -> str:
         seen.append(schema)
     outcomes = ", ".join(f"`{name}` ({stage})" for name, stage in OUTCOMES.items())
     parts.append(
-        "## Outcomes\n\nCodes of `outcome` from 0, with the stage that decides each; where several grasps failed,\n"
+        "## Outcomes\n\nCodes of `outcome` from 0, with the deciding stage. Where several grasps failed,\n"
         f"the one that came furthest counts: {outcomes}."
     )
     causes = ", ".join(f"`{cause}`" for cause in REDRAW_CAUSES)
