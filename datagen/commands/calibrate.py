@@ -14,7 +14,6 @@ from datagen.console.options import AllowIncomplete, AsJson, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.display.progress import steps
 from datagen.evaluation.report_tables import with_interval
-from datagen.reports.specification_summary import specification_record
 from datagen.schemas.errors import InputError, one_line, printable
 from datagen.schemas.run import open_runs
 from datagen.schemas.specification import HeuristicParams, Specification
@@ -89,7 +88,7 @@ def calibrate(
         "positives": int(trials.label.sum()),
         "scenes": len(trials.house),
         "houses": len(set(trials.house)),
-        "runs": [specification_record(spec) for spec in specs],
+        "runs": [spec.summary() for spec in specs],
         "heuristic": {"before": before.model_dump(), "after": after.model_dump()},
         "folds": [params.model_dump() for params in left_out.params],
         **_agreements(

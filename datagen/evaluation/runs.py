@@ -9,7 +9,6 @@ from typing import Any
 
 from datagen.evaluation.columns import EXTRA
 from datagen.released import checkpoint_file
-from datagen.reports.specification_summary import specification_record
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import open_runs
 from datagen.schemas.specification import Specification
@@ -50,7 +49,7 @@ class EvaluatedRun:
             "scenes": self.stream.n_scenes,
             "samples": self.stream.n_samples,
             "whole_grids_of": self.cells or None,
-            "parts": [specification_record(spec) for spec in self.specs],
+            "parts": [spec.summary() for spec in self.specs],
             "origin": self.stream.origin(),
         }
 

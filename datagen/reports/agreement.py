@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from datagen.reports.specification_summary import is_disturbed
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_committed
@@ -69,7 +68,7 @@ def read_labels(run: Run) -> Labels:
 def fidelity(spec: Specification) -> tuple[int, bool]:
     """Rank of a specification's labels: heuristic, plan, sim, disturbed sim."""
     known = spec.label_source in _FIDELITY
-    return (_FIDELITY.index(spec.label_source) if known else 0, is_disturbed(spec))
+    return (_FIDELITY.index(spec.label_source) if known else 0, spec.is_disturbed)
 
 
 def agreements(runs: Sequence[Labels]) -> list[dict[str, Any]]:
@@ -88,7 +87,7 @@ def agreements(runs: Sequence[Labels]) -> list[dict[str, Any]]:
 
 
 def _name(spec: Specification) -> str:
-    return f"{spec.label_source} disturbed" if is_disturbed(spec) else spec.label_source
+    return f"{spec.label_source} disturbed" if spec.is_disturbed else spec.label_source
 
 
 def equal_share(first: Labels, second: Labels) -> dict[str, Any]:

@@ -290,6 +290,23 @@ class Specification(_Frozen):
         return digest_of(self.model_dump(mode="json", exclude_none=True))
 
     @property
+    def is_disturbed(self) -> bool:
+        """Whether each candidate has several trials with random disturbances."""
+        return self.arm is not None and self.arm.disturbance is not None
+
+    def summary(self) -> dict[str, Any]:
+        """The fields that reports show, with the hash."""
+        return {
+            "spec_hash": self.hash(),
+            "label_source": self.label_source,
+            "disturbed": self.is_disturbed,
+            "split": self.split,
+            "seed": self.seed,
+            "candidates": self.candidates.within or "grid",
+            "per_scene": self.candidates.count,
+        }
+
+    @property
     def scenes_hash(self) -> str:
         """Hash of the scenes and candidates: equal for runs that label the same ones."""
         return self.scenes_from.spec_hash if self.scenes_from else self.hash()
