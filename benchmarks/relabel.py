@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from datagen.relabelling import relabel_all, relabelled_specification
+from datagen.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import open_storage
@@ -38,7 +38,7 @@ def main() -> None:
         print(f"{options.samples:,} labels in {len(source.committed())} shards")
         wall, cpu = time.perf_counter(), time.process_time()
         again = relabelled_specification(source, {"heuristic.mu": 0.6})
-        done = relabel_all(open_storage(Path(folder) / "again"), [source], [again])
+        done = relabel_run(open_storage(Path(folder) / "again"), source, again)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         assert done.end == "complete"
         _print(done.runs[0], options.samples, wall, cpu)

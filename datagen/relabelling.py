@@ -1,9 +1,9 @@
-"""Relabel all committed shards of runs into a new run; distances, visibilities and files are kept."""
+"""Relabel all committed shards of a run into a new run; distances, visibilities and files are kept."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from datagen.cluster.attempt_guard import Meter, this_host
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.job_monitor import JobProgress
-from datagen.cluster.protocol import AttemptResult, JobSummary, StopRequest, empty_summary, stop_on_signals
+from datagen.cluster.protocol import AttemptResult, JobSummary, StopRequest, stop_on_signals
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.configuration.specify import manifest_of
@@ -23,17 +23,11 @@ from datagen.display.progress import Progress
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import sample_ids
 from datagen.schemas.record_files import (
-    MAX_RECORD_BYTES,
-    MERGED,
-    encode_record,
-    part_folder,
-    publish,
-    refuse_foreign,
     shard_folder,
     utc_now,
 )
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Commit, FileEntry, Merged, ShardRanges, StageClock
+from datagen.schemas.run_records import Commit, FileEntry, ShardRanges, StageClock
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_files import encode_array, group_metadata
 from datagen.schemas.shard_reading import read_committed
@@ -59,12 +53,12 @@ class Flips:
 
 @dataclass
 class Relabelled:
-    """The result of a call, over all runs."""
+    """The result of a call."""
 
-    runs: list[Run] = field(default_factory=list)
-    summary: JobSummary = field(default_factory=empty_summary)
-    flips: Flips = field(default_factory=Flips)
-    absent: int = 0  # planned shards that the source lacks
+    run: Run
+    summary: JobSummary
+    flips: Flips
+    absent: int  # planned shards that the source lacks
 
 
 def relabelled_specification(
@@ -96,41 +90,21 @@ def relabelled_specification(
     return spec.model_copy(update={"engines": dict(before.engines)})
 
 
-def relabel_all(
-    storage: Storage, sources: Sequence[Run], specs: Sequence[Specification], json: bool = False
-) -> Relabelled:
-    """Relabel every committed shard of the runs that is missing in `storage`, and seal.
+def relabel_run(storage: Storage, source: Run, spec: Specification, json: bool = False) -> Relabelled:
+    """Relabel every committed shard of the run that is missing in `storage`, and seal.
 
-    One specification gives a run, several give merged runs. InputError when `storage` holds something else.
+    InputError when `storage` holds something else.
     """
-    for source in sources:
-        if not source.committed():
-            raise InputError(source.storage.url, "commits", "no shard is committed", "Resume the run first")
-    # Runs of the same scenes by different rules become one run, made from the longest.
-    longest: dict[str, tuple[Run, Specification]] = {}
-    for source, spec in zip(sources, specs, strict=True):
-        found = longest.get(spec.hash())
-        if found is None or len(found[0].committed()) < len(source.committed()):
-            longest[spec.hash()] = (source, spec)
-    pairs = [longest[spec_hash] for spec_hash in sorted(longest)]
-    done = Relabelled()
-    if len(pairs) > 1:
-        _refuse_other_runs(storage, sorted(longest))
-    for source, spec in pairs:
-        below = storage if len(pairs) == 1 else storage.below(part_folder(spec.hash()))
-        done.runs.append(_open_target(below, source, spec))
-    if len(pairs) > 1:
-        _write_merged(storage, sorted(longest))
-    stop = StopRequest()
+    if not source.committed():
+        raise InputError(source.storage.url, "commits", "no shard is committed", "Resume the run first")
+    run, flips, stop = _open_target(storage, source, spec), Flips(), StopRequest()
+    planned = run.missing()
+    missing = planned.within(ShardRanges.of(source.committed()))
     with stop_on_signals(stop, interrupt=True), Progress(json) as shown:
-        for run, (source, _) in zip(done.runs, pairs, strict=True):
-            planned = run.missing()
-            missing = planned.within(ShardRanges.of(source.committed()))
-            done.absent += len(planned) - len(missing)
-            done.summary = done.summary.plus(_relabel_run(run, source, missing, stop, done.flips, shown))
-    if done.summary.end in ("complete", "failed") and any(run.committed() for run in done.runs):
+        summary = _relabel_shards(run, source, missing, stop, flips, shown)
+    if summary.end in ("complete", "failed") and run.committed():
         seal(storage)
-    return done
+    return Relabelled(run, summary, flips, len(planned) - len(missing))
 
 
 def _open_target(storage: Storage, source: Run, spec: Specification) -> Run:
@@ -144,36 +118,7 @@ def _open_target(storage: Storage, source: Run, spec: Specification) -> Run:
     return run
 
 
-def _refuse_other_runs(storage: Storage, hashes: Sequence[str]) -> None:
-    """Raise InputError where the storage holds anything but these runs, before a part is started."""
-    if storage.exists("manifest.json"):
-        problem = f"holds one run, but {len(hashes)} would be written"
-        raise InputError(storage.url, "manifest.json", problem, "Choose another --out")
-    stored = storage.get(MERGED, MAX_RECORD_BYTES)
-    if stored is None:
-        # An interrupted call may have left parts, and a draft of the record.
-        refuse_foreign(storage, "parts/", MERGED)
-    elif stored != _merged_record(hashes):
-        raise _other_runs(storage)
-
-
-def _merged_record(hashes: Sequence[str]) -> bytes:
-    return encode_record(Merged(parts=tuple(hashes)))
-
-
-def _other_runs(storage: Storage) -> InputError:
-    return InputError(f"{storage.url}/{MERGED}", "parts", "has other merged runs", "Choose another --out")
-
-
-def _write_merged(storage: Storage, hashes: Sequence[str]) -> None:
-    record = _merged_record(hashes)
-    if storage.get(MERGED, MAX_RECORD_BYTES) in (None, record):
-        publish(storage, MERGED, record)
-    if storage.get(MERGED, MAX_RECORD_BYTES) != record:  # also where another process wrote first
-        raise _other_runs(storage)
-
-
-def _relabel_run(
+def _relabel_shards(
     run: Run, source: Run, missing: Sequence[int], stop: StopRequest, flips: Flips, shown: Progress
 ) -> JobSummary:
     """Relabel the shards of one run in this process; files are linked, not computed."""

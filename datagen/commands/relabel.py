@@ -11,9 +11,9 @@ from typing import Literal
 from datagen.console.command_lines import command_line, print_interrupted
 from datagen.console.options import AsJson, RunPath
 from datagen.console.printing import counted, print_json, print_rows, seconds
-from datagen.relabelling import Relabelled, relabel_all, relabelled_specification
+from datagen.relabelling import Relabelled, relabel_run, relabelled_specification
 from datagen.schemas.errors import InputError
-from datagen.schemas.run import open_runs
+from datagen.schemas.run import Run
 from datagen.schemas.storage import Storage, open_storage
 
 
@@ -39,7 +39,8 @@ def relabel(
     Distances are in metres, or shares of the reach with --distance planar-over-reach or mount-over-reach.
     Parameters that are not given stay as in the run; an option overrides the file. The new run equals that of
     `datagen submit heuristic --scenes-from RUN`, and shares all files except labels, scores and ids. The same
-    command again resumes it, or extends it after the run has grown.
+    command again resumes it, or extends it after the run has grown. The parts of a merged run are relabelled
+    one by one.
 
     For example: datagen relabel runs/first --tau 0.6 --out runs/stricter
 
@@ -61,14 +62,14 @@ def relabel(
         "alpha": alpha, "tau": tau, "distance": distance,
     }  # fmt: skip
     options = {f"heuristic.{name}": value for name, value in given.items() if value is not None}
-    sources = open_runs(run)
-    specs = [relabelled_specification(source, options, config) for source in sources]
-    if all(spec.heuristic == s.manifest.spec.heuristic for spec, s in zip(specs, sources, strict=True)):
+    source = Run.open(run)
+    spec = relabelled_specification(source, options, config)
+    if spec.heuristic == source.manifest.spec.heuristic:
         problem = "has these parameters already"
         raise InputError(run, "heuristic", problem, "Give another parameter, such as --tau, or --config")
     storage = open_storage(out)
     started_s = time.monotonic()
-    done = relabel_all(storage, sources, specs, json)
+    done = relabel_run(storage, source, spec, json)
     return _report(run, out, storage, done, time.monotonic() - started_s, json)
 
 
@@ -78,9 +79,9 @@ def _report(run: str, out: str, storage: Storage, done: Relabelled, elapsed_s: f
         "run": storage.url,
         "source": run,
         "end": summary.end,
-        "spec_hashes": [r.manifest.spec_hash for r in done.runs],
+        "spec_hash": done.run.manifest.spec_hash,
         "labels": labels,
-        "wanted": sum(r.n for r in done.runs),
+        "wanted": done.run.n,
         "positives": positives,
         "now_good": done.flips.to_good,
         "now_bad": done.flips.to_bad,

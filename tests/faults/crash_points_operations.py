@@ -9,7 +9,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from datagen.cluster.run_recorder import close_lost_attempts
-from datagen.relabelling import relabel_all, relabelled_specification
+from datagen.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.cleaning import clean_runs
 from datagen.schemas.checking.repair import repair_runs
@@ -248,7 +248,7 @@ def _relabelled(folder: Path) -> None:
 def _relabel(folder: Path) -> None:
     source = Run.open(folder / "a")
     spec = relabelled_specification(source, {"heuristic.tau": 0.5})
-    done = relabel_all(open_storage(folder / "out"), [source], [spec], json=True)
+    done = relabel_run(open_storage(folder / "out"), source, spec, json=True)
     if done.summary.end != "complete":
         raise InputError(folder / "out", "", done.summary.cause, "Again")  # as the command does
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from datagen import cli
 from datagen.configuration.stored_scenes import open_stored_scenes, specify_again
-from datagen.relabelling import relabel_all, relabelled_specification
+from datagen.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.run import Run
 from datagen.schemas.specification import HeuristicParams
 from datagen.schemas.storage import open_storage
@@ -50,9 +50,9 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def relabelled(source: Path, out: Path, rule: dict[str, Any]) -> Run:
     run = Run.open(source)
     spec = relabelled_specification(run, {f"heuristic.{name}": value for name, value in rule.items()})
-    done = relabel_all(open_storage(out), [run], [spec])
+    done = relabel_run(open_storage(out), run, spec)
     assert done.summary.end == "complete"
-    return done.runs[0]
+    return done.run
 
 
 def score(d: float, rho: float, params: HeuristicParams) -> float:

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from datagen.cluster.run_recorder import close_lost_attempts
-from datagen.relabelling import relabel_all, relabelled_specification
+from datagen.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.cleaning import clean_runs
 from datagen.schemas.checking.repair import repair_runs
@@ -236,15 +236,14 @@ class AnyHistory(RuleBasedStateMachine):
     def relabel(self, data: st.DataObject, rule_name: str) -> None:
         """The stored scenes by another rule, in a place of their own."""
         place = self.draw_place(data)
-        if place.rule or not all(part.committed for part in place.parts.values()):
+        if place.rule or len(place.parts) > 1 or not all(part.committed for part in place.parts.values()):
             return
         folder = self.new_folder()
-        runs = open_runs(place.folder)
+        run = Run.open(place.folder)
         options = {f"heuristic.{k}": v for k, v in changed_fields(RULES[rule_name]).items()}
-        specs = [relabelled_specification(run, options) for run in runs]
-        for run, spec in zip(runs, specs, strict=True):
-            SPECS[run.manifest.spec.seed, rule_name] = spec
-        relabel_all(open_storage(folder), runs, specs)
+        spec = relabelled_specification(run, options)
+        SPECS[run.manifest.spec.seed, rule_name] = spec
+        relabel_run(open_storage(folder), run, spec)
         parts = {
             (seed, rule_name): Part(part.n, part.committed & set(part.planned))
             for (seed, _), part in place.parts.items()
