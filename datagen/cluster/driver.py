@@ -75,7 +75,7 @@ class Events(Protocol):
 @dataclass
 class _Flight:
     order: AttemptOrder
-    number: int  # of the attempt, per driver
+    number: int  # counts the attempts of this driver
     submitted_s: float
     check_s: float  # when to check it next
     alone: bool  # no other attempt was in flight at the same time

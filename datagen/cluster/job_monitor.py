@@ -124,7 +124,7 @@ class JobRecorder:
             submission=os.environ.get(SUBMISSION, ""),
             jobs_api=os.environ.get(JOBS_API, ""),
         )
-        self._before = JobTotals(0)  # of the runs that this job has finished
+        self._before = JobTotals(0)  # sums over the finished runs
         self._state = JobState(id=record.id, updated=record.started, phase="starting", shards=shards)
         jobs.begin(record)
         self._put()

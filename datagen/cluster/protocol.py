@@ -16,7 +16,7 @@ from datagen.schemas.specification import Specification
 
 T_contra = TypeVar("T_contra", contravariant=True)
 End = Literal["complete", "failed", "interrupted", "aborted"]  # each worse than the one before
-EXIT_CODES = {"failed": 1, "aborted": 2, "interrupted": 130}  # of the command line; 0 for other ends
+EXIT_CODES = {"failed": 1, "aborted": 2, "interrupted": 130}  # exit codes; 0 for other ends
 
 
 class Task(Protocol):
@@ -110,7 +110,7 @@ class JobCannotContinue(Exception):
 class JobTotals:
     """Counts since this driver began. Seconds are sums over attempts."""
 
-    shards: int  # of this job, without those done before
+    shards: int  # this job's, without those done before
     committed: int = 0
     superseded: int = 0  # shards that another driver or an earlier attempt had committed
     elsewhere: int = 0  # shards that another driver had committed before an attempt began here

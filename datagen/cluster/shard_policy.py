@@ -37,7 +37,7 @@ class RetryPolicy:
     queue_deadlines: float = 20.0  # deadlines after which an attempt that has not begun is lost
     drain_s: float = 60.0  # how long a stop waits for attempts in flight
     kill_s: float = 10.0  # how long the driver waits for a killed attempt to be reported
-    max_quarantined_share: float = 0.01  # of this job's shards; above it the job fails
+    max_quarantined_share: float = 0.01  # share of this job's shards; above it the job fails
     give_up_after: int = 20  # quarantined shards before the share may end the job early
     look_s: float = 5.0  # between two checks of the commits of other drivers
     look_factor: float = 20.0  # and at least this multiple of the duration of the last check
@@ -50,7 +50,7 @@ class ShardFailures:
 
     failures: int = 0
     lost: int = 0  # those that count
-    successes: int = 0  # of other shards in this job, when this one was last lost
+    successes: int = 0  # committed shards of this job when this one was last lost
     out_of_memory: int = 0
     hangs: int = 0
     attempts: tuple[str, ...] = ()

@@ -23,9 +23,9 @@ class JobResult:
     n: int = 0  # labels wanted
     made_from: str = ""  # houses, objects and robot
     labels: int = 0  # made by this job
-    positives: int = 0  # of those
+    positives: int = 0  # among them
     shards: int = 0  # that were missing when the job began
-    remaining: int = 0  # of those, still missing
+    remaining: int = 0  # still missing
     quarantined: tuple[int, ...] = ()
     retries: int = 0
     start_s: float = 0.0  # until the first shard began

@@ -53,7 +53,7 @@ class JobState(StoredRecord):
     id: JobId
     updated: str
     phase: Literal["starting", "making", "sealing", "ended"]
-    shards: int = Field(default=0, ge=0)  # of this job, without those of earlier jobs
+    shards: int = Field(default=0, ge=0)  # without those of earlier jobs
     done: int = Field(default=0, ge=0)
     in_flight: int = Field(default=0, ge=0)
     labels: int = Field(default=0, ge=0)

@@ -44,7 +44,7 @@ def test_one_failure_is_repeated_and_then_forgotten(word: str) -> None:
     assert summary.totals.labels == 60 and summary.totals.positives == 18
 
 
-def test_three_failures_of_any_kind_quarantine_the_shard_with_its_story() -> None:
+def test_three_failures_of_any_kind_quarantine_the_shard_with_their_causes() -> None:
     summary, recorder, _, _ = run_script({2: ["crashed", "hung", "failed"]})
     trouble = recorder.given_up[2]
     assert trouble.causes == ("crashed: scripted crashed", "hung: scripted hung", "failed: scripted failed")
@@ -158,7 +158,7 @@ def test_a_worker_that_lost_the_answer_to_its_commit_has_committed() -> None:
     assert recorder.closed == {"committed": 3, "failed": 1, "superseded": 1}
 
 
-def test_a_shard_that_somebody_else_cancels_is_made_all_the_same() -> None:
+def test_a_shard_cancelled_by_another_process_is_made() -> None:
     summary, recorder, _, heard = run_script({3: ["cancelled"]})
     assert summary.end == "complete" and summary.totals.committed == 6
     assert recorder.closed == {"committed": 6, "lost": 1} and (3, "lost", "retry") in heard.actions
@@ -200,7 +200,7 @@ def test_one_request_drains_and_two_end_at_once() -> None:
     assert summary.remaining == 1000 - summary.totals.committed
 
 
-def test_a_stop_that_leaves_nothing_to_do_is_none() -> None:
+def test_a_stop_request_after_the_last_shard_has_no_effect() -> None:
     summary, _, _ = stopping_at(12, 1, LENIENT, 5.0)
     assert summary.remaining == 0
     assert summary.end == "complete" and summary.exit_code == 0
@@ -221,15 +221,15 @@ def test_the_window_bounds_what_is_in_flight() -> None:
         assert executor.most_in_flight == 2 * slots
 
 
-def test_books_that_cannot_be_written_end_what_is_in_flight() -> None:
-    class FullBooks(PaperRecorder):
+def test_a_ledger_that_cannot_be_written_ends_attempts_in_flight() -> None:
+    class FullLedger(PaperRecorder):
         def close(self, entry: LedgerEntry) -> None:
             raise InputError("RUN/ledger", "", "No space left on device", "Free disk space")
 
     clock = FakeClock()
     executor = SimulatedExecutor(clock, lambda o, n: ("committed", 1.0))
     with pytest.raises(InputError, match="No space left"):
-        drive(range(50), lambda o: o, executor, FullBooks(), RetryPolicy(), Heard(), StopRequest(), clock)
+        drive(range(50), lambda o: o, executor, FullLedger(), RetryPolicy(), Heard(), StopRequest(), clock)
     assert executor.in_flight == 0
 
 
@@ -278,5 +278,5 @@ def test_twenty_thousand_shards_on_a_bad_cluster() -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**32), st.sampled_from([500, 1500]), st.sampled_from([1, 3, 16]))
-def test_any_bad_cluster_ends_right(seed: int, shards: int, nodes: int) -> None:
+def test_the_driver_keeps_its_sums_on_any_bad_cluster(seed: int, shards: int, nodes: int) -> None:
     simulate(shards, seed, nodes)

@@ -36,7 +36,7 @@ def test_attempts_of_a_killed_driver_are_closed_once_their_shards_are_decided(tm
     }  # fmt: skip
 
 
-def test_what_is_closed_says_all_that_is_known(tmp_path: Path) -> None:
+def test_a_closed_attempt_has_all_that_is_known(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", shards=())
     for attempt, shard in (("lost", 0), ("won", 1)):
         run.ledger.start(attempt, shard)

@@ -55,7 +55,7 @@ def test_drivers_that_begin_together_waste_little(
     assert np.all(np.mean(wasted, axis=0) <= (attempts, share))
 
 
-def test_open_shards_come_in_order_while_nobody_else_is_there() -> None:
+def test_open_shards_come_in_order_without_another_driver() -> None:
     for seed in range(20):
         open_ = OpenShards([7, 3, 4, 1], random.Random(seed))
         given_out = [open_.next() for _ in range(5)]

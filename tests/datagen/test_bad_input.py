@@ -84,7 +84,7 @@ def test_a_bad_option(
 @pytest.mark.parametrize(
     ("kind", "number"), [("grid", "60"), ("clear", "grid"), ("in-range", "grid")], ids=str
 )
-def test_a_set_of_candidates_that_their_number_contradicts(
+def test_candidates_that_contradict_their_number(
     kind: str, number: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     chosen = ["--candidates", kind, "--candidates-per-scene", number]
@@ -93,15 +93,13 @@ def test_a_set_of_candidates_that_their_number_contradicts(
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "here", "", ":", "a:b", "127.0.0.1:99999"])
-def test_a_cluster_that_is_not_there(
-    address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unreachable_cluster(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["submit", "heuristic", "--n", "16", "--out", str(tmp_path / "out"), "--address", address]
     refused(arguments, capsys, "--address", address, "--address local")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_no_render_device_is_said_before_there_is_a_run(
+def test_a_missing_render_device_is_reported_before_a_run_exists(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("sapien", reason="SAPIEN cannot be imported here", exc_type=ImportError)

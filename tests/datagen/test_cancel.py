@@ -47,9 +47,7 @@ class Work:
             time.sleep(0.05)
 
 
-def test_a_job_is_seen_stopped_and_told_of_from_elsewhere(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_process_sees_and_stops_a_job(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "run"
     work = Work(run)
     seen = work.wait_until_it_makes_shards()
@@ -73,7 +71,7 @@ def test_a_job_is_seen_stopped_and_told_of_from_elsewhere(
     assert "none is running" in capsys.readouterr().out
 
 
-def test_at_once_ends_a_shard_in_the_middle_of_it_or_after(tmp_path: Path) -> None:
+def test_cancel_now_ends_the_job_at_once(tmp_path: Path) -> None:
     work = Work(tmp_path / "run")
     work.wait_until_it_makes_shards()
     assert cli.run(["cancel", str(tmp_path / "run"), "--now"]) == 0
@@ -82,9 +80,7 @@ def test_at_once_ends_a_shard_in_the_middle_of_it_or_after(tmp_path: Path) -> No
     assert job.stop == "now" and job.state is not None and job.state.end == "interrupted"
 
 
-def test_a_job_that_was_killed_is_dead_and_nobody_waits_for_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_cancel_does_not_wait_for_a_killed_job(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "run"
     work = Work(run)
     job = work.wait_until_it_makes_shards()
@@ -104,7 +100,7 @@ def test_a_job_that_was_killed_is_dead_and_nobody_waits_for_it(
     assert "is dead: its process has ended" in capsys.readouterr().out
 
 
-def test_a_job_that_lives_and_does_not_answer_is_waited_for_no_longer(
+def test_cancel_gives_up_on_a_live_job_that_does_not_answer(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = tmp_path / "run"
@@ -129,7 +125,7 @@ def test_a_job_that_lives_and_does_not_answer_is_waited_for_no_longer(
     assert work.process.wait(800) == 130  # the request stands
 
 
-def test_a_job_elsewhere_that_is_silent_is_asked_and_not_waited_for(
+def test_cancel_asks_a_silent_job_of_another_host_without_waiting(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from tests.made_runs import make_run
@@ -143,7 +139,7 @@ def test_a_job_elsewhere_that_is_silent_is_asked_and_not_waited_for(
     assert Jobs(place).stop_of(record.id) == "drain"
 
 
-def test_what_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_cancel_refuses_a_folder_without_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     refused(["cancel", str(tmp_path), "--head"], capsys, str(tmp_path), "one of the two")
     refused(["cancel"], capsys, "RUN")
     for verb in ("cancel", "status"):

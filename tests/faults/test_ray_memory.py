@@ -20,7 +20,7 @@ from tests.faults.scripted import FILL_BYTES, ScriptedTask, perform
 pytestmark = pytest.mark.slow
 
 
-def test_who_fills_the_memory_is_ended_and_tried_once_more(
+def test_a_worker_that_fills_the_memory_is_ended_and_its_shard_retried_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for number in range(4):  # another program that grows or ends meanwhile moves the threshold

@@ -58,14 +58,14 @@ def test_a_job_is_dead_when_it_is_silent_and_its_process_is_gone(
     assert job.health(at) == "ended"
 
 
-def test_a_process_that_only_has_the_number_is_not_the_job(tmp_path: Path) -> None:
+def test_a_reused_process_number_is_not_the_job(tmp_path: Path) -> None:
     # This process began before now, and long after the job did.
     jobs, at = Jobs(open_storage(tmp_path)), datetime.now(UTC)
     jobs.begin(record_of(at - timedelta(days=3000), os.getpid()))
     assert jobs.all()[0].health(at) == "dead"
 
 
-def test_a_request_to_end_at_once_is_not_taken_back_by_a_gentler_one(tmp_path: Path) -> None:
+def test_a_request_to_stop_at_once_is_not_replaced_by_a_weaker_one(tmp_path: Path) -> None:
     jobs, job = Jobs(open_storage(tmp_path)), new_job_id()
     assert jobs.stop_of(job) is None
     for at_once, expected in ((False, "drain"), (True, "now"), (False, "now")):

@@ -121,7 +121,7 @@ def test_more_than_the_source_has_is_refused_with_how_many_there_are(
         ("--candidates-per-scene", "9"),
     ],
 )
-def test_what_decides_scenes_is_refused_beside_it(
+def test_options_that_decide_scenes_are_refused_with_scenes_from(
     more: tuple[str, ...], source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     told = refused(again_arguments(source, tmp_path / "run", N, *more), capsys, more[0], "--scenes-from")
