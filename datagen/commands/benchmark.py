@@ -118,15 +118,13 @@ def score(
     for run, each in zip(wanted.values(), opened, strict=True):
         if run.objects == "test":
             refuse_trained_objects(each, compared)
-    gathered = score_runs(opened, compared, json)
+    columns, seconds = score_runs(opened, compared, json)
     parts: list[Part] = []
     for k, (name, run) in enumerate(wanted.items()):
-        columns = gathered.columns.of_scenes(gathered.columns.run == k)
-        parts += (
-            parts_of_grids(name, columns) if run.is_of_grids else [Part(name, columns, {"in-range": (k,)})]
-        )
-    report = evaluation_report(gathered, compared, opened, parts, [Path(p).name for p in fitted_on], {})
+        part = columns.of_scenes(columns.run == k)
+        parts += parts_of_grids(name, part) if run.is_of_grids else [Part(name, part, {"in-range": (k,)})]
+    report = evaluation_report(seconds, compared, opened, parts, [Path(p).name for p in fitted_on], {})
     report["runs"] = [{**each, "place": name} for each, name in zip(report["runs"], wanted, strict=True)]
     report["benchmark"] = definition.record(wanted)
-    write_report(report, gathered, files)
+    write_report(report, columns, files)
     return report

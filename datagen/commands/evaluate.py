@@ -100,10 +100,10 @@ def evaluate(
     if not methods:
         fix = "Name a checkpoint, or omit --baselines"
         raise InputError("datagen evaluate", "PATH", "no model or baseline given", fix)
-    gathered = score_runs(runs, methods, json, n_examples=4)
-    columns, seen = gathered.columns, plain.houses.union(*(model.houses for model in models))
+    columns, seconds = score_runs(runs, methods, json)
+    seen = plain.houses.union(*(model.houses for model in models))
     parts = parts_by_houses(columns, seen, candidate_sets_of(runs))
-    report = evaluation_report(gathered, methods, runs, parts, fitted_on, plain.left_out, arrivals)
+    report = evaluation_report(seconds, methods, runs, parts, fitted_on, plain.left_out, arrivals)
     if closed_loop:
         from datagen.evaluation.arrival_outcomes import PLAN, SIM, make_all
         from datagen.evaluation.closed_loop import loop_record, plan_loop
@@ -117,7 +117,7 @@ def evaluate(
                 print_interrupted("; finished arrivals are kept", sys.argv[1:])
                 raise KeyboardInterrupt
         report["closed_loop"] = loop_record(loop, judged)
-    write_report(report, gathered, files)
+    write_report(report, columns, files)
     return report
 
 

@@ -19,7 +19,6 @@ EXTRA = (
     *("base_is_clear", "distance_m", "mount_distance_m", "visibility", "outcome"),
     *("house_id", "object_name", "object_digest", "scene_index"),
 )
-_EXAMPLE_POINTS = 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,41 +77,19 @@ class Columns:
 _SCENE_COLUMNS = ("house", "target", "target_digest", "run", "is_grid")
 
 
-@dataclass(frozen=True, eq=False)
-class Example:
-    """An example scene: its number, and P of its points with their colours."""
-
-    scene: int
-    points_m: F32  # (P, 3), target frame
-    rgb: U8  # (P, 3)
-    target_mask: Bools  # (P,)
-
-
-@dataclass(frozen=True, eq=False)
-class Gathered:
-    """The columns of runs, example scenes, and the seconds that each method took to score all runs."""
-
-    columns: Columns
-    examples: tuple[Example, ...]
-    seconds: Mapping[str, float]
-
-
 def gather(
     runs: Sequence[tuple[int, Iterable[Batch[Array]]]],
     scorers: Mapping[str, Scorer],
-    rng: np.random.Generator,
-    n_examples: int = 0,
     seen: Callable[[int], None] = lambda scenes: None,
-) -> Gathered:
-    """Score every candidate of every run by every scorer, a batch at a time.
+) -> tuple[Columns, dict[str, float]]:
+    """The columns of runs, and the seconds that each scorer took for all their candidates.
 
     Scorers are given by name. A run is (cells of its whole grids, or 0 where it has none; batches with
-    `EXTRA`). Examples are drawn uniformly from the scenes with whole grids and a positive. `seen` is called
-    with the number of each batch's scenes. InputError where a score is not finite or a scene occurs twice.
+    `EXTRA`). `seen` is called with the number of each batch's scenes. InputError where a score is not finite
+    or a scene occurs twice.
     """
     parts: list[dict[str, Any]] = []
     seconds = dict.fromkeys(scorers, 0.0)
-    examples: list[tuple[float, Example]] = []  # with a random number, by which the first are kept
     known: set[bytes] = set()
     n_scenes = n_robots = 0
     for run, (cells, batches) in enumerate(runs):
@@ -122,19 +99,13 @@ def gather(
                 started_s = time.perf_counter()
                 part[f"score {name}"] = scored(scorer, batch)
                 seconds[name] += time.perf_counter() - started_s
-            scenes = len(batch.clouds)
-            part |= _scenes(batch, run, cells)
             _refuse_twice(batch, part["scene"] - n_scenes, known)
-            positives = np.bincount(part["scene"] - n_scenes, part["label"], scenes)
-            for row in np.flatnonzero(part["is_grid"] & (positives > 0)):
-                examples.append((rng.random(), _example(batch, int(row), n_scenes)))
-            examples = sorted(examples, key=lambda drawn: drawn[0])[:n_examples]
-            parts.append(part)
-            n_scenes, n_robots = n_scenes + scenes, n_robots + len(batch.robots)
-            seen(scenes)
+            parts.append(part | _scenes(batch, run, cells))
+            n_scenes, n_robots = n_scenes + len(batch.clouds), n_robots + len(batch.robots)
+            seen(len(batch.clouds))
     joined = {name: np.concatenate([p.pop(name) for p in parts]) for name in list(parts[0])}
     scores = {name: joined.pop(f"score {name}") for name in scorers}
-    return Gathered(Columns(**joined, scores=scores), tuple(example for _, example in examples), seconds)
+    return Columns(**joined, scores=scores), seconds
 
 
 def _rows(batch: Batch[Array], first_scene: int, first_robot: int) -> dict[str, Array]:
@@ -170,10 +141,3 @@ def _refuse_twice(batch: Batch[Array], scene_row: Array, known: set[bytes]) -> N
         if name in known:
             raise InputError("RUN", "sample_id", f"{name.hex()} occurs twice", "Name every run once")
         known.add(name)
-
-
-def _example(batch: Batch[Array], row: int, first_scene: int) -> Example:
-    clouds = batch.clouds
-    n = min(int(clouds.n_points[row]), _EXAMPLE_POINTS)
-    points_m, rgb, mask = (a[row, :n].copy() for a in (clouds.points_m, clouds.rgb, clouds.target_mask))
-    return Example(first_scene + row, points_m, rgb, mask)

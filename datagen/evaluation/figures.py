@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
@@ -22,15 +21,15 @@ from datagen.display.styles import (
     MODEL_COLOURS,
     MODEL_MARKERS,
     SCORE_COLOURS,
-    TARGET,
 )
 from datagen.evaluation.closed_loop import AT_RANDOM, BY_LABELS
-from datagen.evaluation.columns import Columns, Example
+from datagen.evaluation.columns import Columns
 from datagen.evaluation.grids import PICKS, picks
 from datagen.evaluation.report_tables import METRIC_WORDS, Report, models_first
+from datagen.train.inputs import F64, I64
 
 _SHOWN = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick")
-_MOST_METHODS = 5
+_MOST_METHODS, _MOST_EXAMPLES = 5, 4
 _PANEL_IN = 2.55
 _TRUTH = ListedColormap(CELL_COLOURS)
 _REACH_COLOUR = "#1b3a6b"
@@ -52,9 +51,8 @@ GRIDS_CAPTION = (
     "Scenes drawn at random from those with a good base pose, seen from above; x and y are relative to the "
     "target. Truth: blue is good, pale orange is bad, grey is where the base collides. Methods: their scores "
     "where the base fits, from red (lowest) to blue (highest). The pick is a gold star where it is good, a "
-    "white cross where it is bad. The dashed circle is the arm's reach; the target's points are pink."
+    "white cross where it is bad. The dashed circle is the arm's reach; the target is at the cross."
 )
-F64 = npt.NDArray[np.float64]
 
 
 def draw_intervals(report: Report, scores: Report) -> Figure:
@@ -167,25 +165,27 @@ def _draw_line(
     ax.errorbar(x_cm[order], y, bars, elinewidth=0.8, capsize=2, label=plain(name), **look)
 
 
-def draw_examples(
-    examples: Sequence[Example], columns: Columns, records: Sequence[Mapping[str, Any]]
-) -> Figure:
-    """One row per scene: the cloud from above, the truth, and the scores and picks of up to five methods."""
+def example_scenes(columns: Columns) -> I64:
+    """A few random scenes with whole grids and a good candidate."""
+    positives = np.bincount(columns.scene, columns.label, columns.n_scenes)
+    scenes = np.flatnonzero(columns.is_grid & (positives > 0))
+    return np.random.default_rng(0).permutation(scenes)[:_MOST_EXAMPLES]
+
+
+def draw_examples(scenes: I64, columns: Columns, records: Sequence[Report]) -> Figure:
+    """One row per scene: the truth, and the scores and picks of up to five methods."""
     names = [record["name"] for record in models_first(records)][:_MOST_METHODS]
-    figure = new_figure(_PANEL_IN * (2 + len(names)), 0.55 + _PANEL_IN * len(examples) * 1.08)
-    panels = figure.subplots(len(examples), 2 + len(names), squeeze=False)
-    for row, example in enumerate(examples):
-        rows = columns.scene == example.scene
-        grid = columns.at(rows)
-        seen, truth, *scored = panels[row].tolist()
-        _draw_cloud(seen, example, grid)
-        seen.set_ylabel(f"{columns.target[example.scene]}\ny [m]", fontsize=9)
+    figure = new_figure(_PANEL_IN * (1 + len(names)), 0.55 + _PANEL_IN * len(scenes) * 1.08)
+    panels = figure.subplots(len(scenes), 1 + len(names), squeeze=False)
+    for row, scene in enumerate(scenes):
+        grid = columns.at(columns.scene == scene)
+        truth, *scored = panels[row].tolist()
         _draw_truth(truth, grid)
+        truth.set_ylabel(f"{columns.target[scene]}\ny [m]", fontsize=9)
         for ax, name in zip(scored, names, strict=True):
             _draw_scores(ax, grid, grid.scores[name])
-        if row == 0:
-            for ax, title in zip(panels[0], ("cloud", "truth", *names), strict=True):
-                ax.set_title(title, fontsize=10)
+    for ax, title in zip(panels[0], ("truth", *map(plain, names)), strict=True):
+        ax.set_title(title, fontsize=10)
     for ax in panels[-1]:
         ax.set_xlabel("x [m]", fontsize=9)
     for ax in panels.ravel():
@@ -196,33 +196,17 @@ def draw_examples(
     return figure
 
 
-def _edges(grid: Columns) -> tuple[float, float, float, float]:
-    """Left, right, bottom and top (m) of the cells of a square grid."""
-    low, high = grid.base_xy_m.min(axis=0), grid.base_xy_m.max(axis=0)
-    half = (high - low) / (2 * max(round(len(grid) ** 0.5) - 1, 1))
-    (left, bottom), (right, top) = (low - half).tolist(), (high + half).tolist()
-    return left, right, bottom, top
-
-
 def _draw_image(ax: Axes, grid: Columns, values: F64, **look: Any) -> None:
     """Draw values (N,) as an image; the N candidates fill a square grid."""
-    side, edges = round(len(grid) ** 0.5), _edges(grid)
+    side = round(len(grid) ** 0.5)
+    low, high = grid.base_xy_m.min(axis=0), grid.base_xy_m.max(axis=0)
+    half = (high - low) / (2 * max(side - 1, 1))
+    (left, bottom), (right, top) = (low - half).tolist(), (high + half).tolist()
     # Cells of a row have equal y except for float32 rounding.
     by_y = np.argsort(grid.base_xy_m[:, 1], kind="stable").reshape(side, side)
     by_x = np.take_along_axis(by_y, np.argsort(grid.base_xy_m[by_y, 0], axis=1, kind="stable"), axis=1)
-    ax.imshow(values[by_x], origin="lower", extent=edges, interpolation="nearest", **look)
-    ax.set(xlim=edges[:2], ylim=edges[2:])
-
-
-def _draw_cloud(ax: Axes, example: Example, grid: Columns) -> None:
-    low_first = np.argsort(example.points_m[:, 2])
-    xyz, rgb = example.points_m[low_first], example.rgb[low_first] / 255
-    ax.scatter(xyz[:, 0], xyz[:, 1], s=3, c=rgb, lw=0, rasterized=True)
-    target = example.points_m[example.target_mask]
-    ax.scatter(target[:, 0], target[:, 1], s=4, color=TARGET.colour, lw=0, rasterized=True)
-    edges = _edges(grid)
-    ax.set(xlim=edges[:2], ylim=edges[2:])
-    _draw_reach(ax, grid)
+    extent = (left, right, bottom, top)
+    ax.imshow(values[by_x], origin="lower", extent=extent, interpolation="nearest", **look)
 
 
 def _draw_truth(ax: Axes, grid: Columns) -> None:

@@ -9,12 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from pydantic import ValidationError
 
 from datagen.configuration.toml_files import first_of, read_toml
 from datagen.display.progress import counting, steps
-from datagen.evaluation.columns import Gathered, gather
+from datagen.evaluation.columns import Columns, gather
 from datagen.evaluation.comparisons import NO_TRAINING, Method, TrainedBy
 from datagen.evaluation.runs import EvaluatedRun, refuse_no_trials, stream_of
 from datagen.evaluation.score_files import ScoreFile, read_scores
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
     from datagen.train.training.checkpoints import CheckpointHead
 
 NONE = "none"
-# Seed of resamples, example scenes, arrivals and fitted baselines.
+# Seed of resamples, arrivals and fitted baselines.
 SEED = 0
 # Training regime of a checkpoint's stage: stage 2 is the second of two stages.
 REGIMES = {"stage1": "stage1", "sim-only": "sim-only", "stage2": "two-stage"}
@@ -272,9 +271,9 @@ def refuse_seen_houses(
 
 
 def score_runs(
-    runs: Sequence[EvaluatedRun], methods: Sequence[EvaluatedMethod], json: bool, n_examples: int = 0
-) -> Gathered:
-    """The columns of all runs in stored order, and `n_examples` scenes to show, with progress.
+    runs: Sequence[EvaluatedRun], methods: Sequence[EvaluatedMethod], json: bool
+) -> tuple[Columns, dict[str, float]]:
+    """The columns of all runs in stored order, and each method's seconds per 600 candidates, with progress.
 
     InputError for two methods of one name.
     """
@@ -290,8 +289,8 @@ def score_runs(
             seen(done, total)
 
         batches = [(run.cells, run.stream.epoch(0)) for run in runs]
-        rng = np.random.default_rng([SEED, 0])
-        return gather(batches, {m.name: m.scorer for m in methods}, rng, n_examples, step)
+        columns, seconds = gather(batches, {m.name: m.scorer for m in methods}, step)
+    return columns, {name: 600 * spent_s / len(columns) for name, spent_s in seconds.items()}
 
 
 def house_share(head: CheckpointHead) -> float:

@@ -14,7 +14,7 @@ from datagen.console.printing import print_json, print_rows
 from datagen.schemas.safe_files import whole_file
 
 if TYPE_CHECKING:
-    from datagen.evaluation.columns import Gathered
+    from datagen.evaluation.columns import Columns
 
 Outputs = Annotated[Sequence[str | Path] | None, Parameter(metavar="PATH")]
 
@@ -27,14 +27,14 @@ def output_files(out: Sequence[str | Path] | None) -> list[Path]:
     return files
 
 
-def write_report(report: dict[str, Any], gathered: Gathered, files: Sequence[Path]) -> None:
+def write_report(report: dict[str, Any], columns: Columns, files: Sequence[Path]) -> None:
     """Write the report to each of the files."""
     from datagen.evaluation.report_page import page_of
 
     for file in files:
         with whole_file(file, alone=True) as stream:
             if file.suffix.lower() == ".html":
-                stream.write(page_of(report, gathered).encode())
+                stream.write(page_of(report, columns).encode())
             else:
                 stream.write((json_format.dumps(report, indent=1, allow_nan=False) + "\n").encode())
 

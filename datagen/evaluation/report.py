@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from datagen import __version__
-from datagen.evaluation.columns import Columns, Gathered
+from datagen.evaluation.columns import Columns
 from datagen.evaluation.comparisons import Method
 from datagen.evaluation.grids import arrival_table, mixed_grids
 from datagen.evaluation.methods import SEED, EvaluatedMethod
@@ -66,7 +66,7 @@ def parts_of_grids(name: str, columns: Columns) -> list[Part]:
 
 
 def evaluation_report(
-    gathered: Gathered,
+    seconds_per_600: Mapping[str, float],
     methods: Sequence[EvaluatedMethod],
     runs: Sequence[EvaluatedRun],
     parts: Sequence[Part],
@@ -74,7 +74,10 @@ def evaluation_report(
     left_out: Mapping[str, str],
     arrivals: Sequence[Arrival] = (),
 ) -> dict[str, Any]:
-    """All numbers; undefined ones are None. InputError where no part has a table."""
+    """All numbers; undefined ones are None. `seconds_per_600` candidates are by method.
+
+    InputError where no part has a table.
+    """
     judged = [each.method for each in methods]
     objects = frozenset[str]().union(*(each.objects for each in methods))
     made = [_part(part, judged, objects, arrivals) for part in parts]
@@ -86,10 +89,7 @@ def evaluation_report(
         "paper": PAPER,
         "runs": [run.record() for run in runs],
         "fitted_on": list(fit),
-        "methods": [
-            each.record() | {"seconds_per_600": 600 * gathered.seconds[each.name] / len(gathered.columns)}
-            for each in methods
-        ],
+        "methods": [each.record() | {"seconds_per_600": seconds_per_600[each.name]} for each in methods],
         "left_out": dict(left_out),
         "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "level": LEVEL, "by": "scene"},
         "parts": made,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from datagen.console.printing import print_rows
 from datagen.display.html_page import escape, html_facts, html_figure, html_page, html_table
-from datagen.evaluation.columns import Gathered
+from datagen.evaluation.columns import Columns
 from datagen.evaluation.report_tables import (
     Report,
     Table,
@@ -41,12 +41,12 @@ def print_evaluation(report: Report) -> None:
     print_rows("notes", notes(report))
 
 
-def page_of(report: Report, gathered: Gathered) -> str:
-    """The whole page. `gathered` has the scenes of the example grids."""
+def page_of(report: Report, columns: Columns) -> str:
+    """The whole page. `columns` has the example grids."""
     from datagen.display.figures import svg_of
 
     body = [html_facts(notes(report))]
-    for k, block in enumerate(blocks(report, gathered)):
+    for k, block in enumerate(blocks(report, columns)):
         if isinstance(block, str):
             body.append(f"<h2>{escape(block)}</h2>")
         elif isinstance(block, Picture):
@@ -64,7 +64,7 @@ def page_of(report: Report, gathered: Gathered) -> str:
     return html_page(subject, body)
 
 
-def blocks(report: Report, gathered: Gathered | None = None) -> Iterator[str | Table | Picture]:
+def blocks(report: Report, columns: Columns | None = None) -> Iterator[str | Table | Picture]:
     """Headings, tables and pictures, in order; pictures are drawn only on demand."""
     from datagen.evaluation import figures
 
@@ -85,7 +85,7 @@ def blocks(report: Report, gathered: Gathered | None = None) -> Iterator[str | T
         yield next(tables)
         yield Picture(partial(figures.draw_loop, report), figures.LOOP_CAPTION)
         yield from tables
-    if gathered is not None and gathered.examples:
+    if columns is not None and len(scenes := figures.example_scenes(columns)):
         yield "Example grids"
-        draw = partial(figures.draw_examples, gathered.examples, gathered.columns, report["methods"])
+        draw = partial(figures.draw_examples, scenes, columns, report["methods"])
         yield Picture(draw, figures.GRIDS_CAPTION)

@@ -15,7 +15,6 @@ import pytest
 import torch
 
 from datagen import cli
-from datagen.evaluation.columns import Gathered
 from datagen.evaluation.methods import EvaluatedMethod
 from datagen.evaluation.report import Part, evaluation_report
 from datagen.evaluation.runs import candidate_sets_of, open_evaluated_runs
@@ -124,10 +123,9 @@ def test_a_candidate_set_is_reported_over_the_runs_that_cover_it(grids: Path) ->
     assert candidate_sets_of([near]) == {"in-range": (0,)} and (near.cells, run.cells) == (0, CELLS)
     columns = make_columns(np.random.default_rng(0), 40)
     columns = replace(columns, run=np.arange(40) % 2)
-    gathered = Gathered(columns, (), {"random": 1.0})
     methods = [EvaluatedMethod("random", ScoreFile("random", "", 0.5, True, {}))]
     sets = {"in-range": (0, 1), "clear": (1,)}
-    report = evaluation_report(gathered, methods, [], [Part("all", columns, sets)], [], {})
+    report = evaluation_report({"random": 1.0}, methods, [], [Part("all", columns, sets)], [], {})
     clear = report["parts"][0]["sets"]["clear"]
     assert clear["count"] == (columns.is_clear & (columns.run[columns.scene] == 1)).sum()
 
