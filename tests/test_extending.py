@@ -125,7 +125,7 @@ def test_a_run_with_all_three_sources_at_once(tmp_path: Path, capsys: pytest.Cap
     for k in range(3):
         (rooms / f"room{k}.json").write_text(json.dumps(_ROOM | {"height_m": 0.7 + 0.05 * k}))
     lines = [f"box{k},{0.05 + 0.004 * k},{0.07},{0.06 + 0.01 * k},{0.1 + 0.05 * k}" for k in range(8)]
-    boxes.write_text("\n".join(["name,x_m,y_m,z_m,mass_kg", *lines]) + "\n")
+    boxes.write_text("\n".join(lines) + "\n")
     sources = ("--houses", f"one-table:{rooms}", "--objects", f"boxes:{boxes}")
     make_small_run(run, 64, *sources)
     arrays = arrays_of(run)
