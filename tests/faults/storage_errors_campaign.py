@@ -65,7 +65,9 @@ def _damaged(folder: Path) -> None:
 
 OPERATIONS = (
     Operation("attempt", lambda folder: make_run(folder, 20, shards=[0]), lambda f: ["attempt", str(f)]),
-    Operation("seal", lambda folder: make_run(folder, 20), lambda f: ["verify", str(f), "--repair"]),
+    Operation(
+        "seal", lambda folder: make_run(folder, 20), lambda f: ["verify", str(f), "--repair"], codes=(1, 2)
+    ),
     Operation(
         "merge",
         _apart,

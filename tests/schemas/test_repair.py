@@ -94,6 +94,17 @@ def test_an_unfinished_run_is_sealed(tmp_path: Path) -> None:
     assert repair_at(tmp_path).left == [] and not (tmp_path / "data.zarr").exists()  # nothing is committed
 
 
+def test_a_store_that_cannot_be_made_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_run(tmp_path, 10)
+
+    def full(*_: Any) -> str:
+        raise InputError("the disk", "", "No space left on device", "Free disk space")
+
+    monkeypatch.setattr(repair, "seal", full)
+    (left,) = repair_at(tmp_path).left
+    assert (left.key, left.kind) == ("data.zarr", "sealed") and "No space left" in left.fix
+
+
 def test_repair_is_refused_while_a_job_may_be_alive(tmp_path: Path) -> None:
     run = make_place(tmp_path, 19)
     record = JobRecord(id=new_job_id(), command=(), host="h", pid=1, started=utc_now(), address="local")

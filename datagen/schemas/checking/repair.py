@@ -19,7 +19,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import SET_ASIDE, commit_key, encode_record, end_key
 from datagen.schemas.run import Run, label_counts, open_runs
 from datagen.schemas.run_records import LedgerEntry
-from datagen.schemas.sealing import seal, unseal
+from datagen.schemas.sealing import SEALED, seal, unseal
 from datagen.schemas.storage import Storage
 
 # Restoring a record reveals what depends on it: commits, then shards, then the sealed store.
@@ -155,8 +155,9 @@ def _reseal(storage: Storage, result: Repaired) -> bool:
                 return result.checked.is_sealed or has_labels
         except InputError as error:
             why = str(error)
-    result.left = [
-        replace(finding, fix=why, cure=None) if isinstance(finding.cure, Reseal) else finding
-        for finding in result.left
-    ]
+    kept = [finding for finding in result.left if not isinstance(finding.cure, Reseal)]
+    outdated = [replace(finding, fix=why, cure=None) for finding in result.left if finding not in kept]
+    if not result.left:
+        outdated = [Finding(SEALED, "sealed", "cannot be made", why)]
+    result.left = [*kept, *outdated]
     return False
