@@ -27,6 +27,7 @@ summary { cursor: pointer; padding: .2rem 0; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; }
 th, td { padding: .2rem .6rem; text-align: right; vertical-align: top; border-bottom: 1px solid var(--line); }
 th { background: var(--band); font-weight: 600; }
+td { white-space: pre-wrap; }
 td + td { white-space: nowrap; }
 th:first-child, td:first-child, table.text td, table.text th { text-align: left; }
 figure { margin: .6rem 0 1.2rem; padding: .4rem; background: #ffffff; color: #1b1f24;
@@ -62,8 +63,8 @@ def escape(text: str) -> str:
 
 
 def html_table(headings: Sequence[str], lines: Iterable[Sequence[str]], kind: str = "") -> str:
-    """A table in a box that scrolls; `kind` is "text" where columns are not numbers."""
-    head = "".join(f"<th>{escape(h)}</th>" for h in headings)
+    """A table in a box that scrolls; `kind` is "text" for columns of text. Headings may be blank."""
+    head = "".join(f"<th>{escape(h)}</th>" for h in headings) if any(headings) else ""
     body = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in line) + "</tr>\n" for line in lines)
     return f'<div class="scroll" tabindex="0"><table class="{kind}"><tr>{head}</tr>\n{body}</table></div>'
 

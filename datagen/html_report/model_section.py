@@ -47,7 +47,7 @@ def model_section(path: Path, name: str) -> Iterator[str]:
     cost = [(key.removesuffix("_s").replace("_", " "), seconds(spent)) for key, spent in head.cost.items()]
     yield "<h3>Cost</h3>" + html_table(("", "time"), cost)
     options, versions = (
-        ", ".join(f"{k} {v}" for k, v in sorted(d.items())) for d in (head.options, head.versions)
+        ", ".join(f"{k} {v}" for k, v in sorted(d.items()) if v) for d in (head.options, head.versions)
     )
     facts = [("file", str(path)), ("sha256", head.digest), ("began from", began)]
     yield "<h3>Provenance</h3>" + html_facts([*facts, ("options", options), ("versions", versions)])
