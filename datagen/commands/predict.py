@@ -89,7 +89,7 @@ class PredictOptions:
         base_height: Height of the arm's mount above the floor (m); only --demo has a default.
         reach: Reach of the arm from its mount (m); only --demo has a default.
         demo: Predict on the frame that ships with the package; writes demo.png and demo.html.
-        frame: Frame as a folder or .npz; several with poses are fused.
+        frame: Frame as a folder, .npz or .ply; several with poses are fused.
         click: Pixel u,v on the target in the first frame, where it has no mask.
         camera_height: Height of the frame's camera (m), where it has no pose.
         gravity: Direction of gravity x,y,z in the camera frame (x right, y down).

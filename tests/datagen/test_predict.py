@@ -90,7 +90,7 @@ def test_an_answer_as_json_picture_and_page(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.html", "a.png"]
 
 
-def test_a_click_and_the_same_frame_as_folder_and_archive(
+def test_a_click_and_the_same_frame_as_folder_archive_and_cloud(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     frame = made / "posed"
@@ -101,20 +101,33 @@ def test_a_click_and_the_same_frame_as_folder_and_archive(
     numbers = json.loads((frame / "intrinsics.json").read_text())
     four = np.array([numbers[k] for k in ("fx", "fy", "ppx", "ppy")])
     np.savez(tmp_path / "a.npz", rgb=rgb, depth=depth, mask=mask, intrinsics=four, T_world_camera=pose)
-    v, u = np.nonzero(mask)
+    v, u = np.nonzero(depth)
+    z = depth[v, u] / 1000
+    xyz = np.stack([(u - four[2]) / four[0] * z, (v - four[3]) / four[1] * z, z], axis=1)
+    rows = np.zeros(len(z), [("p", "<f4", 3), ("c", "u1", 3), ("target", "u1")])
+    rows["p"], rows["c"], rows["target"] = xyz, rgb[v, u], mask[v, u]
+    names = [*(f"float {a}" for a in "xyz"), *(f"uchar {c}" for c in ("red", "green", "blue", "target"))]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(z)}"]
+    head += [f"property {name}" for name in names] + ["element face 0", "end_header", ""]
+    (tmp_path / "a.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
+
     rest = ["--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2"]
     # Without hand poses, whose clearances are in cells, so that rounded depths could change them by one.
     checkpoint = str(tmp_path / "model.ckpt")
     write_untrained(tmp_path / "model.ckpt", MODEL | {"hand_poses": 0})
+    x, y, z = (-np.array(pose)[2, :3]).tolist()
+    level = ["--gravity", f"{x},{y},{z}", "--camera-height", str(pose[2][3])]
     answers = {
         "folder": ["--frame", str(frame)],
         "npz": ["--frame", str(tmp_path / "a.npz")],
+        "ply": ["--frame", str(tmp_path / "a.ply"), *level],
         "click": ["--frame", frame_with(frame, tmp_path, mask=None)],
     }
-    middle = np.argmin((v - v.mean()) ** 2 + (u - u.mean()) ** 2)
+    middle = np.argmin((v - np.nonzero(mask)[0].mean()) ** 2 + (u - np.nonzero(mask)[1].mean()) ** 2)
     answers["click"] += ["--click", f"{u[middle]},{v[middle]}"]
     found = {name: json_of(capsys, ["predict", checkpoint, *given, *rest]) for name, given in answers.items()}
-    whole = found["folder"]
+    whole, cloud = found["folder"], found.pop("ply")
+    assert cloud["target"]["center_m"][2] == pytest.approx(whole["target"]["center_m"][2], abs=1e-5)
     for name, answer in found.items():
         gap = np.subtract(answer["target"]["center_m"], whole["target"]["center_m"])
         assert np.linalg.norm(gap) < (0.01 if name == "click" else 1e-5), name
@@ -178,6 +191,19 @@ def bad_files(folder: Path) -> None:
         (folder / f"{name}.json").write_text(json.dumps({"T_world_camera": pose.tolist()}))
     (folder / "pose_rows.json").write_text(json.dumps([[1, 0, 0], [0, 1, 0]]))
 
+    vertex = "property float x\nproperty float y\nproperty float z\n"
+    for name, head, body in (
+        ("none", "format ascii 1.0\nelement vertex 0\n" + vertex, b""),
+        ("many", "format binary_little_endian 1.0\nelement vertex 1000000000000\n" + vertex, b"\0" * 100),
+        ("short", "format binary_little_endian 1.0\nelement vertex 1000000\n" + vertex, b"\0" * 100),
+        ("flat", "format ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n", b"0 0\n"),
+        ("words", "format ascii 1.0\nelement vertex 2\n" + vertex, b"1 2 3\n1 b 3 \n"),
+        ("lists", "format ascii 1.0\nelement vertex 2\nproperty list uchar int x\n", b"1 2\n"),
+        ("minus", "format ascii 1.0\nelement vertex -2\n" + vertex, b"1 2\n"),
+    ):
+        (folder / f"{name}.ply").write_bytes(b"ply\n" + head.encode() + b"end_header\n" + body)
+    (folder / "noply.ply").write_text("solid\n")
+
     np.savez(folder / "objects.npz", depth=np.array([{}, 1], object), allow_pickle=True)
     np.savez(folder / "other.npz", colours=np.zeros(3))
     np.savez(folder / "norgb.npz", depth=np.ones((4, 4), np.uint16))
@@ -240,6 +266,14 @@ REFUSED: list[tuple[str, str, str]] = [
     ("--gravity", "0,-9.8,0", "sign"),
     ("--click", "10,10", "is given for a frame with a mask"),
     ("--frame", "{bad}/missing", "--frame"),
+    ("--frame", "{bad}/none.ply", "no vertices"),
+    ("--frame", "{bad}/many.ply", "1,000,000,000,000"),
+    ("--frame", "{bad}/short.ply", " vertices"),
+    ("--frame", "{bad}/flat.ply", "no property z"),
+    ("--frame", "{bad}/words.ply", "numbers"),
+    ("--frame", "{bad}/lists.ply", "is not valid"),
+    ("--frame", "{bad}/minus.ply", "-2"),
+    ("--frame", "{bad}/noply.ply", "that of a PLY"),
     ("--frame", "{bad}/objects.npz", "object"),
     ("--frame", "{bad}/other.npz", "has none of"),
     ("--frame", "{bad}/norgb.npz", "rgb"),
@@ -364,3 +398,17 @@ def test_a_foreign_checkpoint(made: Path, tmp_path: Path, capsys: pytest.Capture
     given = arguments(made)
     given[1] = str(tmp_path / "bad.ckpt")
     refused(given, capsys, "bad.ckpt")
+
+
+@pytest.mark.parametrize("z", [0.0, 1.0])
+def test_a_cloud_of_equal_points(
+    z: float, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It has an answer or an error, and no traceback: a point was drawn more than once into the sample."""
+    n, target = 4000, "property uchar target\n"
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat ascii 1.0\nelement vertex {n}\n{axes}{target}end_header\n"
+    (tmp_path / "equal.ply").write_text(head + f"0.5 0.2 {z} 1\n" * n)
+    given = arguments(made, "--frame", str(tmp_path / "equal.ply"), "--gravity", "0,1,0")
+    assert cli.run(given) in (0, 1, 2)
+    assert "Traceback" not in capsys.readouterr().err

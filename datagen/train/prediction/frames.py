@@ -22,6 +22,7 @@ from datagen.train.prediction.files import (
     read_rgb,
     valid_depth,
 )
+from datagen.train.prediction.ply import read_ply
 
 DEPTH_SCALE_M = 0.001
 # Files of a folder that holds one frame.
@@ -123,7 +124,7 @@ def read_frame(
 
 
 def read_place(place: str | Path, depth_scale_m: float = DEPTH_SCALE_M) -> SensorFrame:
-    """The frame of a folder or of an .npz archive.
+    """The frame of a folder, of an .npz archive or of a .ply cloud.
 
     A folder holds color.png, depth.png, intrinsics.json, and optionally mask.png and pose.json.
     """
@@ -131,12 +132,15 @@ def read_place(place: str | Path, depth_scale_m: float = DEPTH_SCALE_M) -> Senso
     match path.suffix.lower():
         case ".npz":
             return _npz_frame(path, depth_scale_m)
+        case ".ply":
+            cloud = read_ply(path)
+            return SensorFrame(str(path), cloud.points_m, cloud.rgb, cloud.on_target, None, None)
         case _ if path.is_dir():
             more = [path / name if (path / name).exists() else None for name in (MASK, POSE)]
             files = (path / RGB, path / DEPTH, path / INTRINSICS)
             return read_frame(*files, mask=more[0], pose=more[1], depth_scale_m=depth_scale_m)
         case _:
-            fix = f"Name a folder with {RGB}, {DEPTH} and {INTRINSICS}, or an .npz archive"
+            fix = f"Name a folder with {RGB}, {DEPTH} and {INTRINSICS}, an .npz archive or a .ply cloud"
             raise InputError(path, "--frame", "is not a frame", fix)
 
 

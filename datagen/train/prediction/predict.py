@@ -251,7 +251,7 @@ def _with_target(
         clicked = image_frame(grown, first.T_world_camera, {"depth": first.place, "mask": "--click"})
         return [clicked, *frames[1:]]
     if not any(frame.on_target is not None for frame in frames):
-        fix = "Give --click u,v, or a mask"
+        fix = "Give --click u,v, or a mask (in a .ply: a vertex property `target`, 1 on the target)"
         raise InputError(first.place, "target", "is not marked", fix)
     return list(frames)
 
