@@ -11,7 +11,7 @@ Source = Mapping[str, Any]
 
 # Costs that are no stages.
 _ADDED = ("other", "waste", "scenes of other runs", "relabelled files")
-_STAGES_SHOWN = 5
+_STAGES_SHOWN = (5, 5, 3)  # for one, two and more label sources, so that 25 lines suffice
 _UNITS = {
     "label": "core time of a label",
     "label_within_reach": "  of a label within reach",
@@ -69,7 +69,9 @@ def _made(sources: Sequence[Source]) -> list[tuple[str, ...]]:
 def _cost(sources: Sequence[Source]) -> list[tuple[str, ...]]:
     """Core time by stage, which adds up to the total, and that of a label."""
     stages = list(dict.fromkeys(name for s in sources for name in s["core_s"] if name not in _ADDED))
-    largest = sorted(stages, key=lambda name: -max(_part(s, name) for s in sources))[:_STAGES_SHOWN]
+    largest = sorted(stages, key=lambda name: -max(_part(s, name) for s in sources))[
+        : _STAGES_SHOWN[min(len(sources), 3) - 1]
+    ]
     small = [name for name in stages if name not in largest]
 
     def cell(*names: str) -> Callable[[Source], str]:
