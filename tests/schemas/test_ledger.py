@@ -90,7 +90,7 @@ def test_a_start_that_is_not_its_commits_follows_from_the_end(run: Run) -> None:
     ],
 )
 def test_stages_of_a_commit_that_take_longer_than_it(run: Run, cost: dict[str, Any], problem: str) -> None:
-    whole = {"wall_s": 1.0, "cpu_s": 1.0} | cost
+    whole = Cost(wall_s=1.0, cpu_s=1.0, **cost).model_dump(mode="json")
     for key in (commit_key(1), commit_copy_key(1, "a-1"), "ledger/a-1.json"):
         edit(folder_of(run) / key, cost=whole)
     findings, _ = check(folder_of(run))
