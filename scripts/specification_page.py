@@ -24,6 +24,7 @@ Fields that are absent by default are commented out, with the values that they h
 
 """
 _RESERVED = {"label_source", "houses", "objects", "scenes_from", "engines"}
+_LENGTH = {"≥": "0", "≤": "100"}  # the bounds of every length
 _LIMITS = ((Ge, "≥", "ge"), (Gt, ">", "gt"), (Le, "≤", "le"), (Lt, "<", "lt"))
 
 
@@ -79,7 +80,9 @@ def _comment(field: FieldInfo) -> str:
         for item in field.metadata
         if isinstance(item, kind)
     }
-    if set(limits) == {"≥", "≤"}:
+    if limits == _LENGTH:
+        bounds = ""
+    elif set(limits) == {"≥", "≤"}:
         bounds = f"{limits['≥']}..{limits['≤']}"
     else:
         bounds = ", ".join(sign + limit for sign, limit in limits.items())
