@@ -20,7 +20,6 @@ def ready_made(folder: Path) -> None:
         val=[folder / "val"],
         out=folder / "model.ckpt",
         epochs=2,
-        batch_scenes=2,
         device="cpu",
     )
     best = head.history[(head.best_epoch or 1) - 1]

@@ -91,7 +91,7 @@ def test_labels_training_and_prediction_beside_a_users_files(installed: Path, fo
         (*heuristic, "--out", "val", "--split", "val", "--n", "8", "--candidates-per-scene", "8"),
         ("show", "run", "--scene", "0", "--out", "scene.png"),
         ("train", "stage1", "run", "--val", "val", "--out", "a.ckpt", "--epochs", "1", *MODEL),
-        ("evaluate", "a.ckpt", "plan", "--bootstrap", "20", "--baselines", "none", "--html", "page.html"),
+        ("evaluate", "a.ckpt", "plan", "--baselines", "none", "--out", "page.html"),
         ("predict", "a.ckpt", "--frame", "frame", *robot, "--out", "heat.png"),
         ("predict", "--demo"),
     ]

@@ -246,15 +246,15 @@ def test_missing_depth_on_the_target_is_filled_and_reported(seen: Seen, scorer: 
     assert np.linalg.norm(answer.center_m - of(scorer, whole).center_m) < 0.01
 
 
-def test_the_five_lines_of_the_page(seen: Seen, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_lines_of_the_page_run(seen: Seen, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import torch
 
     from tests.train.prediction.checkpoints import write_untrained
     from tests.train.prediction.seen_scenes import MODEL
 
-    folder = write_frame(tmp_path / "frame", seen)
-    write_untrained(folder / "model.ckpt", MODEL)
-    monkeypatch.chdir(folder)
+    folder = write_frame(tmp_path / "FOLDER", seen)
+    write_untrained(tmp_path / "model.ckpt", MODEL)
+    monkeypatch.chdir(tmp_path)
     code = re.search(r"```python\n(.*?)```", DOCS.read_text(), re.DOTALL)
     assert code is not None
     assert len([line for line in code[1].splitlines() if line.strip()]) <= 6
@@ -262,4 +262,6 @@ def test_the_five_lines_of_the_page(seen: Seen, tmp_path: Path, monkeypatch: pyt
     exec(code[1], names)
     assert isinstance(names["answer"], Prediction)
     reread = read_place(folder)
-    assert isinstance(load_scorer(folder / "model.ckpt").model, torch.nn.Module) and reread.image is not None
+    assert (
+        isinstance(load_scorer(tmp_path / "model.ckpt").model, torch.nn.Module) and reread.image is not None
+    )
