@@ -20,7 +20,7 @@ class Registry(Generic[T]):
     `list(registry)` gives the names, and `registry[name]` loads one. An unknown name raises InputError with
     the valid ones. A name may also be `module:attribute` outside the package.
 
-    Example:
+    Examples:
         >>> list(datagen.robots)
         ['fetch', 'panda', 'panda-scaled', 'xarm7']
         >>> datagen.robots["fetch"].reach_m

@@ -68,7 +68,7 @@ def evaluate(
     Raises:
         InputError: A checkpoint, a run or an option cannot be used.
 
-    Example:
+    Examples:
         >>> report = datagen.evaluate([checkpoint, sim_run], baselines=["proximity"])
         >>> len(report["methods"]), list(report["parts"][0]["sets"])
         (2, ['in-range'])

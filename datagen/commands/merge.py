@@ -93,7 +93,7 @@ def merge(
     Raises:
         InputError: The runs cannot be merged, or one is damaged.
 
-    Example:
+    Examples:
         >>> merged = datagen.merge([run, other], out=folder / "merged")
         >>> merged["labels"], len(merged["runs"])
         (32, 2)

@@ -163,7 +163,7 @@ def predict(given: PredictOptions) -> Prediction:
     Raises:
         InputError: A frame, the checkpoint or an option cannot be used.
 
-    Example:
+    Examples:
         >>> robot = datagen.robots["fetch"]
         >>> answer = datagen.predict(
         ...     checkpoint, frame=[frame], base_height=robot.base_height_m[0], reach=robot.reach_m[1]

@@ -61,7 +61,7 @@ def resume(options: ResumeOptions) -> JobResult:
         InputError: The run or a source cannot be used.
         KeyboardInterrupt: The job was stopped; the run can be resumed.
 
-    Example:
+    Examples:
         >>> result = datagen.resume(run, workers=0, quiet=True)
         >>> result.complete, result.labels, result.remaining
         (True, 0, 0)

@@ -138,7 +138,7 @@ def submit(options: SubmitOptions) -> JobResult:
         InputError: An option, a source or the run cannot be used.
         KeyboardInterrupt: The job was stopped; the run can be resumed.
 
-    Example:
+    Examples:
         >>> result = datagen.submit(
         ...     "heuristic", n=8, out=folder / "new", candidates_per_scene=8, workers=0, quiet=True
         ... )

@@ -153,7 +153,7 @@ def train_model(given: TrainOptions) -> CheckpointHead:
         InputError: An option or a run cannot be used.
         KeyboardInterrupt: Training was stopped; the same call continues it.
 
-    Example:
+    Examples:
         >>> head = datagen.train_model(
         ...     "stage1", [run], val=[other], out=folder / "model.ckpt", epochs=1, device="cpu"
         ... )

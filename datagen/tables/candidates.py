@@ -113,7 +113,7 @@ def candidates(
     Raises:
         InputError: A path is no run, a run is incomplete or damaged, or a column does not exist.
 
-    Example:
+    Examples:
         >>> table = datagen.candidates(run)
         >>> len(table)
         16

@@ -43,7 +43,7 @@ def open_dataset(
     Raises:
         InputError: A path is no run, a run is incomplete or damaged, or an array does not exist.
 
-    Example:
+    Examples:
         >>> dataset = datagen.open_dataset(run)
         >>> dict(dataset.sizes)["scene"], dict(dataset.sizes)["candidate"]
         (2, 16)

@@ -76,7 +76,7 @@ def stream(*paths: str | Path, **options: Unpack[StreamOptions]) -> TorchStream:
     Raises:
         InputError: A path is no run, a run is incomplete or damaged, or an option is out of range.
 
-    Example:
+    Examples:
         >>> batches = datagen.stream(run, scenes_per_batch=1)
         >>> loader = torch.utils.data.DataLoader(batches, batch_size=None, num_workers=0)
         >>> for epoch in range(2):

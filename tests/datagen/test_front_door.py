@@ -68,7 +68,7 @@ def test_every_name_is_there_and_documented() -> None:
     for name in datagen.__all__:
         value = getattr(datagen, name)
         assert name == "__version__" or value.__doc__
-        assert name not in FUNCTIONS or "Example:" in value.__doc__
+        assert name not in FUNCTIONS or "Examples:" in value.__doc__
 
 
 def test_an_unknown_name_lists_the_others() -> None:

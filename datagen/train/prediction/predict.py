@@ -161,7 +161,7 @@ def load_scorer(checkpoint: str | Path | None = None) -> ModelScorer:
     Raises:
         InputError: The file is no checkpoint.
 
-    Example:
+    Examples:
         >>> scorer = datagen.load_scorer(checkpoint)
         >>> answers = [
         ...     datagen.predict(scorer, frame=[each], base_height=0.7, reach=0.9) for each in [frame, frame]

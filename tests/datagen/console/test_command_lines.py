@@ -38,7 +38,7 @@ class Wanted:
 def make(wanted: Wanted) -> str:
     """Make labels.
 
-    Example:
+    Examples:
         >>> make("sim", n=2)
         'sim 2'
     """
