@@ -8,13 +8,19 @@ from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 
-from datagen.console.command_lines import Interrupted, given_options, prints, words_of
+from datagen.console.command_lines import (
+    Interrupted,
+    absolute_path,
+    absolute_source,
+    given_options,
+    prints,
+    words_of,
+)
 from datagen.console.options import AsJson, PathOrAddress, PathsOrAddresses, Whole
 from datagen.console.printing import print_rows
 from datagen.evaluation.output import Outputs, output_files, print_report, write_report
 from datagen.jobs.job import JobOptions
 from datagen.jobs.job_report import print_job
-from datagen.jobs.start_job import absolute_path, absolute_source
 
 app = App(name="benchmark", help="Make the runs of the frozen benchmark, and score methods on them.")
 

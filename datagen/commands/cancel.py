@@ -8,12 +8,11 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from datagen.cluster.ray_head import running_head, stop_head
+from datagen.cluster.ray_head import head_token, running_head, stop_head
 from datagen.cluster.ray_jobs import open_ray_jobs
 from datagen.console.command_lines import command_line, resume_with
 from datagen.console.options import AsJson
 from datagen.console.printing import counted, print_json, print_rows, seconds
-from datagen.jobs.detach import jobs_api_of
 from datagen.jobs.job_report import health_line, job_report
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import Jobs, StoredJob
@@ -111,7 +110,7 @@ def _answers(job: StoredJob) -> bool:
 def _stop_submission(job: StoredJob) -> None:
     """Stop a detached job through Ray; where Ray has ended, so has the job."""
     try:
-        jobs_api_of(job.record.jobs_api).stop(job.record.submission)
+        open_ray_jobs(job.record.jobs_api, head_token(job.record.jobs_api)).stop(job.record.submission)
     except InputError as error:
         _print_stderr(f"{job.id}: {error}")
 

@@ -8,11 +8,10 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.console.command_lines import command_line, prints, resumable, words_of
+from datagen.console.command_lines import absolute_path, command_line, prints, resumable, words_of
 from datagen.console.options import AsJson, PathOrAddress
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.display.progress import steps
-from datagen.jobs.start_job import absolute_path
 from datagen.reports.spending import account_for
 from datagen.schemas.lineage import lineage_summary
 from datagen.schemas.merging import MergePlan, MergeResult, merge_runs, plan_merge

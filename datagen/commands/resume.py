@@ -11,6 +11,7 @@ from typing import Annotated
 
 from datagen.configuration.stored_scenes import StoredScenes, refuse_too_few
 from datagen.console.command_lines import (
+    absolute_path,
     beginning_s,
     given_options,
     options_of,
@@ -23,7 +24,7 @@ from datagen.console.printing import counted
 from datagen.jobs.detach import detach_job, in_ray_job
 from datagen.jobs.job import Job, JobOptions, JobRun, refuse_odd_n
 from datagen.jobs.job_report import JobResult, print_job
-from datagen.jobs.start_job import absolute_path, open_job_run, with_absolute_paths, words_to_resume
+from datagen.jobs.start_job import open_job_run, with_absolute_paths, words_to_resume
 from datagen.schemas.errors import InputError
 from datagen.schemas.quarantine import lift_quarantine
 from datagen.schemas.run import Run, open_runs

@@ -15,14 +15,20 @@ from datagen.configuration.stored_scenes import (
     refuse_too_few,
     specify_again,
 )
-from datagen.console.command_lines import beginning_s, given_options, options_of, prints, words_of
+from datagen.console.command_lines import (
+    absolute_source,
+    beginning_s,
+    given_options,
+    options_of,
+    prints,
+    words_of,
+)
 from datagen.console.options import LABELLED, ROBOT, RUNNING, Whole, option
 from datagen.display.progress import Progress
 from datagen.jobs.detach import detach_job, in_ray_job
 from datagen.jobs.job import Job, JobOptions, JobRun, refuse_odd_n
 from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.start_job import (
-    absolute_source,
     refuse_unusable_engines,
     with_absolute_paths,
     words_to_resume,

@@ -11,9 +11,12 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import wraps
+from pathlib import Path
 from threading import current_thread, main_thread
 from types import FrameType
 from typing import Any, ParamSpec, TypeVar, get_type_hints
+
+from datagen.schemas.errors import refuse_not_utf8
 
 Verb = TypeVar("Verb", bound=Callable[..., Any])
 Parameters = ParamSpec("Parameters")
@@ -88,6 +91,22 @@ def words_of(options: Mapping[str, object]) -> list[str]:
         elif value is not None and value is not False:
             words += [name, str(value)]
     return words
+
+
+def absolute_source(ref: str) -> str:
+    """A source reference with its file or folder made absolute."""
+    kind, _, text = ref.partition(":")
+    # Text that is not an existing path is a parameter of the source, as in builtin:400.
+    is_path = bool(text) and kind != "builtin" and Path(text).expanduser().exists()
+    return refuse_not_utf8(f"{kind}:{Path(text).expanduser().resolve()}" if is_path else ref)
+
+
+def absolute_path(path: str | Path) -> str:
+    """A run's absolute path or its address, valid in every folder."""
+    path = str(path)
+    if "://" in path and not path.startswith("file://"):
+        return path
+    return str(Path(path.removeprefix("file://")).expanduser().absolute())
 
 
 class Interrupted(KeyboardInterrupt):

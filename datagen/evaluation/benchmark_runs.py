@@ -8,11 +8,12 @@ from pathlib import Path
 
 from datagen.assets.object_split import split_objects
 from datagen.configuration.specify import layout_of, manifest_of
+from datagen.console.command_lines import absolute_source
 from datagen.console.options import Sources
 from datagen.evaluation.benchmark import BenchmarkRun
 from datagen.jobs.job import Job, JobOptions
 from datagen.jobs.job_report import JobResult
-from datagen.jobs.start_job import absolute_source, open_job_run, refuse_other_engines
+from datagen.jobs.start_job import open_job_run, refuse_other_engines
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Manifest

@@ -16,6 +16,8 @@ from datagen.evaluation.arrival_outcomes import Arrived, SceneTask, read_outcome
 from datagen.evaluation.columns import Columns
 from datagen.evaluation.comparisons import Method, comparisons
 from datagen.evaluation.grids import (
+    AT_RANDOM,
+    BY_LABELS,
     DISTANCES_M,
     HARD_SHARE,
     PICKS,
@@ -35,8 +37,6 @@ from datagen.train.arrivals import Arrival, ring_arrival
 from datagen.train.bootstrap import Estimate, Weights, summed
 from datagen.train.inputs import F64, I64, Bools
 
-# Picks without a method: by the labels of the whole grid, and at random.
-BY_LABELS, AT_RANDOM = "best by labels", "random in reach"
 # Nav2 lets a robot be off by 0.25 m and 0.25 rad.
 _YAW_RAD_PER_M = 1.0
 # Arrivals a scene, error and pick. Executing takes most of the time.

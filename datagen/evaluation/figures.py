@@ -22,9 +22,8 @@ from datagen.display.styles import (
     MODEL_MARKERS,
     SCORE_COLOURS,
 )
-from datagen.evaluation.closed_loop import AT_RANDOM, BY_LABELS
 from datagen.evaluation.columns import Columns
-from datagen.evaluation.grids import PICKS, picks
+from datagen.evaluation.grids import AT_RANDOM, BY_LABELS, PICKS, picks
 from datagen.evaluation.report_tables import METRIC_WORDS, Report, models_first
 from datagen.train.inputs import F64, I64
 

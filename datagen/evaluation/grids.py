@@ -22,6 +22,8 @@ from datagen.train.metrics import average_precision, ratio
 
 # A grid is hard where at most this share of its clear cells is good.
 HARD_SHARE = 0.2
+# Picks without a method: by the labels of the whole grid, and at random.
+BY_LABELS, AT_RANDOM = "best by labels", "random in reach"
 # Distances at which robots stop from the goal, in any direction.
 DISTANCES_M = (0.0, 0.03, 0.05, 0.10, 0.15, 0.25)
 PICKS = ("nominal", "smoothed")

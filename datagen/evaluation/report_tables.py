@@ -6,8 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from datagen.evaluation.closed_loop import AT_RANDOM, BY_LABELS
-from datagen.evaluation.grids import HARD_SHARE, PICKS
+from datagen.evaluation.grids import AT_RANDOM, BY_LABELS, HARD_SHARE, PICKS
 
 Report = Mapping[str, Any]
 DECISIONS = ("accuracy", "balanced_accuracy", "area_under_roc")

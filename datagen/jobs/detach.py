@@ -15,7 +15,7 @@ from typing import TypeVar
 from datagen.cluster.cluster_folders import write_private
 from datagen.cluster.environment import JOB_ENVIRONMENT, is_of_the_shell
 from datagen.cluster.job_monitor import JOBS_API, SUBMISSION
-from datagen.cluster.ray_head import ensure_head, head_token
+from datagen.cluster.ray_head import ensure_head
 from datagen.cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
 from datagen.console.command_lines import command_line
 from datagen.console.printing import print_rows
@@ -91,8 +91,3 @@ def _await_begin(jobs: RayJobs, submission: str) -> str:
         if state != "PENDING" or time.monotonic() >= until_s:
             return state
         time.sleep(_POLL_S)
-
-
-def jobs_api_of(url: str) -> RayJobs:
-    """The Jobs API of a detached job. InputError where it does not answer."""
-    return open_ray_jobs(url, head_token(url))

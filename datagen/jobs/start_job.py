@@ -5,18 +5,17 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError
-from pathlib import Path
 from typing import Any, TypeVar
 
 from datagen.cluster.job_monitor import JOBS_API
 from datagen.cluster.ray_head import head_token
 from datagen.configuration.specify import label_engines, refuse_missing_packages, scene_engines
-from datagen.console.command_lines import given_options, words_of
+from datagen.console.command_lines import absolute_path, absolute_source, given_options, words_of
 from datagen.console.options import AS_FOUND, Sources
 from datagen.doctor.engines import probe_render_device
 from datagen.jobs.job import JobOptions, JobRun
 from datagen.replaying import open_sources
-from datagen.schemas.errors import InputError, refuse_not_utf8
+from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import different_fields
 from datagen.schemas.run import Run
 from datagen.schemas.specification import Specification
@@ -100,19 +99,3 @@ def refuse_other_engines(place: str, spec: Specification) -> None:
     if rows:
         fix = "Install the run's versions, or start a new run"
         raise InputError(place, "engines", "; ".join(rows), fix)
-
-
-def absolute_source(ref: str) -> str:
-    """A source reference with its file or folder made absolute."""
-    kind, _, text = ref.partition(":")
-    # Text that is not an existing path is a parameter of the source, as in builtin:400.
-    is_path = bool(text) and kind != "builtin" and Path(text).expanduser().exists()
-    return refuse_not_utf8(f"{kind}:{Path(text).expanduser().resolve()}" if is_path else ref)
-
-
-def absolute_path(path: str | Path) -> str:
-    """A run's absolute path or its address, valid in every folder."""
-    path = str(path)
-    if "://" in path and not path.startswith("file://"):
-        return path
-    return str(Path(path.removeprefix("file://")).expanduser().absolute())

@@ -110,7 +110,7 @@ def _open_run(run: Run, names: Sequence[str], allow_incomplete: bool) -> RunPart
     missing = n - sum(place.samples for place in shards)
     if missing and not allow_incomplete:
         problem = f"{missing:,} of the {n:,} planned samples are missing"
-        fix = f"Make them with `datagen resume {url}`, or accept an incomplete run with --allow-incomplete"
+        fix = f"Make them with `datagen resume {url}`, or allow an incomplete run where that is an option"
         raise InputError(url, "commits", problem, fix)
     if not shards:
         return None

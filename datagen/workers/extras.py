@@ -37,7 +37,7 @@ _PICTURES = {"matplotlib": "matplotlib", "PIL": "pillow", "scipy": "scipy"}
 
 EXTRAS: dict[str, Extra] = {
     "labels": Extra(
-        "heuristic labels; show, replay, relabel, verify --deep",
+        "heuristic labels; show, relabel, verify --replay",
         {"embreex": "embreex", "sapien": "sapien", "trimesh": "trimesh", **_PICTURES},
     ),
     "sim": Extra("plan and sim labels", {"coal": "coal", "pinocchio": "pin", "mani_skill": "mani-skill"}),

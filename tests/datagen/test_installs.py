@@ -129,7 +129,7 @@ def test_labels_are_made_and_shown_without_ray_and_torch(wheel: Path, tmp_path: 
     *made, no_ray, no_cluster, no_sim, no_settler, no_renderer = labels.run(
         submit_arguments(run, PER_SCENE),
         ["show", run, "--scene", "0", "--out", tmp_path / "scene.png"],
-        ["verify", run, "--deep", "1"],
+        ["verify", run, "--replay", "1"],
         ["relabel", run, "--mu", "0.9", "--out", tmp_path / "relabelled"],
         submit_arguments(other, PER_SCENE, workers=1),
         ["resume", run, "--detach"],
@@ -178,7 +178,7 @@ def test_models_are_judged_without_simulators(wheel: Path, tmp_path: Path) -> No
     made = ["submit", "plan", *few, "--config", str(tmp_path / "plan.toml"), "--out", str(tmp_path / "plans")]
     assert cli.run(made) == 0
     write_untrained(tmp_path / "model.ckpt", {})
-    judge = ["evaluate", "model.ckpt", "plans", "--candidates", "in-range", "--bootstrap", "10"]
+    judge = ["evaluate", "model.ckpt", "plans"]
     judged, no_sim = train.run(judge, [*judge, "--baselines", "reachability"])
     assert judged.code == 0, judged
     assert "[sim]" in "".join(judged.out.split())  # why `reachability` is left out

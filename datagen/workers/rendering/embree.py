@@ -8,17 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 
 from datagen.workers.geometry.mesh import F32, F64, I32, U8, Mesh, concatenate, face_normals
 from datagen.workers.houses.house import House
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.rendering import Camera, Frame, Pixels, SceneGeometry, pixel_directions
+
+if TYPE_CHECKING:
+    from embreex.rtcore_scene import EmbreeScene
 
 MISS = np.float32(1e37)  # Embree's parameter of a ray that hit nothing
 
@@ -45,6 +47,10 @@ class RayScene:
 
 def ray_mesh(mesh: Mesh) -> RayMesh:
     """Build the hierarchy of a mesh that has at least one face."""
+    # Not at the top: models are judged, and jobs are cancelled, where Embree is not installed.
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
     hierarchy = EmbreeScene()
     TriangleMesh(
         hierarchy,

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from datagen.evaluation.closed_loop import (
-    AT_RANDOM,
-    BY_LABELS,
     candidates_of,
     draw_offsets,
     label_success,
@@ -16,7 +14,7 @@ from datagen.evaluation.closed_loop import (
 )
 from datagen.evaluation.columns import Columns
 from datagen.evaluation.comparisons import Method, TrainedBy
-from datagen.evaluation.grids import GridMaps, grid_maps, mixed_grids
+from datagen.evaluation.grids import AT_RANDOM, BY_LABELS, GridMaps, grid_maps, mixed_grids
 from datagen.evaluation.scores import weights_for
 from datagen.train.arrivals import ring_arrival
 from datagen.train.inputs import F64
