@@ -132,17 +132,15 @@ def _commonest(source: Source) -> str:
 
 
 def _projection(sources: Sequence[Source]) -> list[tuple[str, ...]]:
-    def days(source: Source, value: float | None, of: str = "") -> str:
-        """Days; simulated labels in weeks, as the paper states them."""
-        if value is None:
-            return "-"
-        is_sim = source["label_source"] == "sim"
-        return f"{value / 7 if is_sim else value:.2g} {of}{'weeks' if is_sim else 'days'}"
+    def time(days: float | None) -> str:
+        return "-" if days is None else seconds(days * 86400)
 
     def paper(source: Source) -> str:
-        stated = source["projection"]["paper_gpu_days"]
-        bound = ">" if source["label_source"] == "sim" else "<"
-        return "-" if stated is None else f"{bound} {days(source, stated, 'GPU-')}"
+        """As the paper states it: days of one GPU, and weeks for executed grasps."""
+        days = source["projection"]["paper_gpu_days"]
+        if source["label_source"] == "sim" and days is not None:
+            return f"> {days / 7:.2g} GPU-weeks"
+        return "-" if days is None else f"< {days:.2g} GPU-days"
 
     def stored(source: Source) -> str:
         value = source["projection"]["bytes"]
@@ -150,8 +148,8 @@ def _projection(sources: Sequence[Source]) -> list[tuple[str, ...]]:
 
     labels = sources[0]["projection"]["labels"]
     return [
-        _row(f"{labels:,} labels, one core", sources, lambda s: days(s, s["projection"]["core_days"])),
-        _row("  within reach", sources, lambda s: days(s, s["projection"]["core_days_within_reach"])),
+        _row(f"{labels:,} labels, one core", sources, lambda s: time(s["projection"]["core_days"])),
+        _row("  within reach", sources, lambda s: time(s["projection"]["core_days_within_reach"])),
         _row("  in the paper", sources, paper),
         _row("  stored", sources, stored),
     ]
