@@ -147,12 +147,13 @@ def _projection(sources: Sequence[Source]) -> list[tuple[str, ...]]:
         return "-" if value is None else size(value)
 
     labels = sources[0]["projection"]["labels"]
-    return [
+    rows = [
         _row(f"{labels:,} labels, one core", sources, lambda s: time(s["projection"]["core_days"])),
         _row("  within reach", sources, lambda s: time(s["projection"]["core_days_within_reach"])),
         _row("  in the paper", sources, paper),
         _row("  stored", sources, stored),
     ]
+    return [row for row in rows if set(row[1:]) != {"-"}]
 
 
 def _costliest(sources: Sequence[Source]) -> list[tuple[str, Mapping[str, Any]]]:
