@@ -257,7 +257,7 @@ def test_a_file_is_checked_against_its_commit_once_per_process(
 def test_an_incomplete_run_is_read_only_with_allow_incomplete(tmp_path: Path):
     make_run(tmp_path, n=30)
     (tmp_path / "commits/000001.json").unlink()
-    words = r"10 of the 30 planned samples are missing\. .*resume.*--allow-incomplete"
+    words = r"10 of the 30 planned samples are missing\. .*resume.*allow an incomplete run"
     for opened in (lambda: SampleReader([tmp_path]), lambda: SampleStream([tmp_path])):
         with pytest.raises(InputError, match=words) as error:
             opened()
