@@ -30,7 +30,7 @@ from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstru
 from datagen.workers.world import open_world
 
 _VIEW_PX, _TEXT_PX, _COLOURS = (120, 72), 12, 48
-_COLUMNS = 2  # of trials
+_COLUMNS = 2  # side by side
 
 
 def main() -> None:

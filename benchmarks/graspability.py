@@ -29,7 +29,7 @@ from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots import gripper_of
 from datagen.workers.robots.description import Gripper
 
-_STABILITY_GRASPS = 8  # of each object
+_STABILITY_GRASPS = 8  # settled with each object
 _VARIANTS = {
     "20 position and 2 velocity iterations, 1/240 s (as used)": HandTest(),
     "40 and 8, 1/240 s": replace(HandTest(), position_iterations=40, velocity_iterations=8),

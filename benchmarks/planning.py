@@ -41,7 +41,7 @@ from datagen.workers.scenes import Scene
 from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.world import World, assemble_world
 
-_POINTS = 8000  # of a scene, for the peer
+_POINTS = 8000  # a scene's cloud, for the peer
 _RESOLUTION_M = 0.02
 
 

@@ -41,7 +41,7 @@ full)
     ;;
 esac
 PER_SCENE=15  # trials in a scene, but for whole grids
-CELLS=625     # of a whole grid
+CELLS=625     # a whole grid has so many
 SEED=100      # each run has one of its own, counted from here
 WORKERS=${WORKERS:-$(nproc)}  # processes that make labels; 0 for none but this one
 FORM=any      # the distance that the calibrated rule may be a function of

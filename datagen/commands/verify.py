@@ -19,7 +19,7 @@ from datagen.schemas.errors import InputError, printable
 from datagen.schemas.storage import Storage, open_storage
 
 _KEPT = 10_000  # findings that are listed; all are counted
-_SHOWN = 50  # of them on a terminal
+_SHOWN = 50  # findings on a terminal
 _AS_FOUND = AssetSources()
 
 

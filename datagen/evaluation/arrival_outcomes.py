@@ -46,7 +46,7 @@ _WORLD = 2  # purposes 0 and 1 of a scene's generators are picks and arrivals
 PLAN, SIM = "plan", "sim"
 _POLL_S = 0.2
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_stop: Event | None = None  # of a process that make_all started
+_stop: Event | None = None  # set in the processes that make_all starts
 
 
 class Arrived(NamedTuple):

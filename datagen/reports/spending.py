@@ -51,7 +51,7 @@ class Spending:
     useful: Account = field(default_factory=Account)
     # By outcome; attempts at shards that are quarantined now are under QUARANTINED, whatever their outcome.
     waste: dict[str, Account] = field(default_factory=dict)
-    causes: dict[str, Account] = field(default_factory=dict)  # of failed attempts
+    causes: dict[str, Account] = field(default_factory=dict)  # failed attempts by their cause
     machines: Counter[str] = field(default_factory=Counter)  # attempts by processor
     # Ledger minus commits minus waste; exactly 0 where every record agrees with its commit.
     difference_s: dict[str, float] = field(default_factory=lambda: {"wall": 0.0, "cpu": 0.0})

@@ -32,7 +32,7 @@ Array = npt.NDArray[Any]
 
 ZSTD_LEVEL = 3
 MAX_CHUNK_BYTES = 4 * 2**20  # of uncompressed numbers; keeps random reads of single clouds cheap
-MAX_TEXT_BYTES = 4096  # of one name
+MAX_TEXT_BYTES = 4096  # the longest name
 
 
 def rows_per_shard(layout: Layout, table: Table) -> int:

@@ -47,7 +47,7 @@ class SceneTable:
     samples: I64  # (S,), in an epoch
     house_of_digest: Mapping[str, str]  # house_digest -> house_id
     house_ids: frozenset[str]
-    object_digests: frozenset[str]  # of targets and clutter
+    object_digests: frozenset[str]  # targets and clutter
     parts: Sequence[PartSummary]
 
     def __len__(self) -> int:

@@ -23,7 +23,7 @@ from tests.small_runs import files_of, json_of
 from tests.train.prediction.checkpoints import stored_with, write_untrained
 from tests.train.prediction.seen_scenes import MODEL, draw_seen, write_frame
 
-HEIGHT_M = 0.8197  # of the scene's camera
+HEIGHT_M = 0.8197  # the scene's camera above the floor
 
 
 @pytest.fixture(scope="module")

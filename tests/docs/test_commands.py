@@ -15,7 +15,7 @@ from tests.conftest import REPOSITORY
 
 PAGES = sorted([REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md")])
 _BLOCK = re.compile(r"^```(?:console)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-_SYNTAX = re.compile(r"[\[\]]|\.\.\.")  # of what may be left out or repeated
+_SYNTAX = re.compile(r"[\[\]]|\.\.\.")  # marks what may be left out or repeated
 _REAL = {"REAL": "", "$REAL": "", "$NEW": "", "$NEAR": "", "$TRIALS": "RUN"}
 
 

@@ -18,7 +18,7 @@ from tests.faults.crash_points_shim import Call, build, read_log
 
 pytestmark = pytest.mark.slow
 
-SAMPLE = 0  # of each kind of end only the first and the last call
+SAMPLE = 0  # each kind of end: only its first and last call
 # Calls that leave files as they are. Any other one that touches a run must be known to the shim.
 READING = {
     "access", "close", "faccessat", "faccessat2", "fadvise64", "fcntl", "flock", "fstat", "fstatfs", "getcwd",

@@ -32,7 +32,7 @@ from tests.faults.crash_points_operations import small_schema
 from tests.made_runs import commit_of, files_of, make_run, rows_of, small_spec, write
 
 PER_SCENE = 3
-SCENES = 12  # of every run; its shards of 1 to 6 scenes divide them
+SCENES = 12  # in every run; its shards of 1 to 6 scenes divide them
 # Every example writes whole runs durably: few examples, short runs.
 # Shrinking one that fails would take an hour, so it is shown as it was found.
 few = settings(

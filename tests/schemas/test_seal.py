@@ -142,7 +142,7 @@ def test_large_clouds_in_several_chunks_a_shard(tmp_path: Path):
     run = make_run(tmp_path, n=1, scenes_per_shard=6, shards=[])
     patch = pytest.MonkeyPatch()
     with patch.context() as m:
-        m.setattr(shard_files, "MAX_CHUNK_BYTES", 1000)  # of real clouds this takes gigabytes
+        m.setattr(shard_files, "MAX_CHUNK_BYTES", 1000)  # real clouds would take gigabytes
         clear_metadata()
         run.grow(75)
         for shard in run.missing():

@@ -47,7 +47,7 @@ def sealed(tmp_path: Path) -> Run:
 
 def test_a_file_that_no_record_knows_is_found(sealed: Run):
     (folder_of(sealed) / "shards/000000/a-0/label/c.9").write_bytes(b"x")
-    (folder_of(sealed) / "shards/000000/other").mkdir()  # of an attempt that did not commit
+    (folder_of(sealed) / "shards/000000/other").mkdir()  # left by an attempt that did not commit
     (folder_of(sealed) / "shards/000000/other/x").write_bytes(b"x")
     assert found(folder_of(sealed)) == [("foreign", "shards/000000/a-0/label/c.9")]
 

@@ -28,7 +28,7 @@ def test_moments_of_the_distributions() -> None:
         np.testing.assert_allclose(arrival.offsets.mean(axis=0), 0, atol=1e-3)
     assert normal.offsets[:, 0].std() == pytest.approx(0.05, rel=0.1)
     assert normal.yaw_std_rad == pytest.approx(0.1, rel=0.1)
-    assert disc.offsets[:, 1].std() == pytest.approx(0.2 / 2, rel=0.05)  # of a uniform disc: R / 2
+    assert disc.offsets[:, 1].std() == pytest.approx(0.2 / 2, rel=0.05)  # a uniform disc has R / 2
     np.testing.assert_allclose(np.hypot(*ring.offsets[:, :2].T), 0.1)
 
 

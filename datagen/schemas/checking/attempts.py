@@ -49,7 +49,7 @@ from datagen.schemas.storage import Storage, StoredFile
 Ledgered = TypeVar("Ledgered", AttemptStart, LedgerEntry)
 
 _ROUNDING = 1e-6
-_ROUNDING_S = 1e-3  # of clocks
+_ROUNDING_S = 1e-3  # clocks are rounded to milliseconds
 _OF_ANOTHER = "is the record of another"
 ODD_COST_FIX = "Find out which program wrote it: the record is undamaged"
 

@@ -139,7 +139,7 @@ class Holding:
     attempt: str  # its name there
     name: str  # its name in the union
     shard: int  # shard in the union
-    files_digest: str  # of the source shard's list of files
+    files_digest: str  # sha256 over the source shard's list of files
     record_digest: str  # of the source shard's commit
 
 

@@ -42,7 +42,7 @@ _MOST_MISSING = 500_000
 class SealedShard:
     """One committed shard and its rows in the store."""
 
-    folder: str  # of its files, relative to the sealed path
+    folder: str  # where its files lie, relative to the sealed path
     scenes: int
     samples: int
 

@@ -206,7 +206,7 @@ class RemoteObjects:
             **connection_settings(),
             "connect_timeout": min(timeout, timedelta(seconds=5)),
             "read_timeout": timeout,
-            "timeout": 10 * timeout,  # of a whole object, over a slow line
+            "timeout": 10 * timeout,  # for a whole object over a slow line
         }
         retries: Any = {"max_retries": 0, "retry_timeout": timeout}
         try:

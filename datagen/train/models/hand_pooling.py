@@ -53,7 +53,7 @@ def from_mount(axes: Tensor, frames: Frames) -> Tensor:
     """Features (N, K, N_SEEN_FROM_MOUNT) of TCP, approach and closing axis (N, K, 3, 3), target frame."""
     forward = frames.forward[:, None, None]
     level = turned(axes[..., :2], forward.expand(*axes.shape[:3], 2))
-    left = level[..., 1]  # of TCP, approach and closing axis; a mirror changes the sign of each
+    left = level[..., 1]  # y of TCP, approach and closing axis; a mirror changes the sign of each
     x, z = level[:, :, 2, 0], axes[:, :, 2, 2]
     # By the approach; for an approach along the line, by the TCP, then by the closing axis.
     side = left[..., 1] + 0.1 * left[..., 0] + 0.01 * left[..., 2] * (x + z)

@@ -23,7 +23,7 @@ class TargetBox:
     """Position and size of the target, world frame; `how` describes how it was found."""
 
     center_m: tuple[float, float, float]
-    radius_m: float  # of the sphere around the centre that holds the target
+    radius_m: float  # the sphere around the centre that holds the target
     support_height_m: float  # of the surface that it stands on
     how: str
 

@@ -56,7 +56,7 @@ class EpochRecord(ValidationMetrics):
 
     epoch: int  # counted from 1
     step: int
-    loss: float  # of training
+    loss: float  # the training loss
     accuracy: float
 
 

@@ -45,7 +45,7 @@ class Options:
     batch_scenes: int = 16
     weight_decay: float = 0.0  # on matrices alone: not on biases and norms
     warmup: float = 0.05  # share of the steps in which the rate rises from 0
-    clip_norm: float = 1.0  # of all gradients together
+    clip_norm: float = 1.0  # bounds the norm of all gradients together
     patience: int = 8  # epochs without a lower validation loss
 
     def __post_init__(self) -> None:

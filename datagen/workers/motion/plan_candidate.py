@@ -55,7 +55,7 @@ class _Search:
     base: _Base
     far: list[_Reachable] = field(default_factory=list)  # without a free straight path
     furthest: str = "no_ik"
-    stages: dict[int, int] = field(default_factory=dict)  # of each grasp tried, in this order
+    stages: dict[int, int] = field(default_factory=dict)  # the stage each grasp reached, in this order
 
     @property
     def at(self) -> Surroundings:
