@@ -12,8 +12,8 @@ import numpy as np
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.protocol import AttemptReport, JobSummary, JobTotals, StopRequest
 from datagen.cluster.shard_policy import RetryPolicy, ShardFailures
-from datagen.schemas.run_records import Commit, Cost, Host, ShardRanges
-from tests.cluster.simulated import FakeClock, Heard, PaperRecorder, report_of
+from datagen.schemas.run_records import Commit, ShardRanges
+from tests.cluster.simulated import FakeClock, Heard, PaperRecorder, commit_by, report_of
 
 # Share of attempts, and how they end. What is silent never ends by itself.
 TROUBLES = ((0.004, "crashed"), (0.003, "failed"), (0.001, "out_of_memory"), (0.001, "silent"))
@@ -132,7 +132,7 @@ class BadCluster:
             zombie = self.rng.random() < ZOMBIES and order.shard not in self.poisoned
             if zombie and self.rng.random() < 0.5 and self._commit(order.shard):
                 # It committed before its node went: the driver finds the record and counts its cost.
-                self.recorder.commits[order.shard] = commit = commit_by(order)
+                self.recorder.commits[order.shard] = commit = commit_by(order.shard, order.attempt)
                 self._count(order.shard, "committed", commit.cost.wall_s)
             elif self.done[order.shard]:
                 self._count(order.shard, "superseded", 0.5)
@@ -145,7 +145,7 @@ class BadCluster:
 
     def _zombie(self, order: AttemptOrder) -> None:
         if order.shard not in self.recorder.given_up and self._commit(order.shard):
-            self.recorder.commits[order.shard] = commit_by(order)
+            self.recorder.commits[order.shard] = commit_by(order.shard, order.attempt)
 
     def _return(self, node: int) -> None:
         self._alive[node] = True
@@ -179,22 +179,11 @@ class _Books(PaperRecorder):
         self.given_up[shard] = ShardFailures()
 
     def commit_of(self, shard: int) -> Commit | None:
-        if shard in self.commits:
-            return self.commits[shard]
-        if not self._cluster.done[shard]:
-            return None
-        return commit_by(AttemptOrder(shard, "another", 0.0))
+        another = commit_by(shard, "another") if self._cluster.done[shard] else None
+        return self.commits.get(shard, another)
 
     def missing(self) -> ShardRanges:
         return ShardRanges.of(np.flatnonzero(np.frombuffer(self._cluster.done, np.uint8) == 0))
-
-
-def commit_by(order: AttemptOrder) -> Commit:
-    host = Host(name="h", cpu="c", cores=1, memory_bytes=1)
-    return Commit(
-        shard=order.shard, attempt=order.attempt, spec_hash="0" * 64, scenes=1, samples=10, positives=3,
-        redraws={}, files=(), cost=Cost(wall_s=6.0, cpu_s=3.0), host=host, created="",
-    )  # fmt: skip
 
 
 class Silent(Heard):

@@ -119,7 +119,9 @@ except grpc.RpcError as error: print(error.code().name)
 
 @needs_root
 def test_another_user_can_neither_enter_nor_read_nor_speak_to_a_local_cluster() -> None:
-    shared = set(Path("/tmp/ray").glob(f"session_*_{os.getpid()}"))  # other tests' clusters have other process ids
+    shared = set(
+        Path("/tmp/ray").glob(f"session_*_{os.getpid()}")
+    )  # other tests' clusters have other process ids
     with ray_cluster(RaySettings(workers=1)) as ray:
         token = str(ray.get(ray.remote(lambda: os.environ["RAY_AUTH_TOKEN"]).remote()))
         folder = Path(ray._private.worker._global_node.temp_dir).parent

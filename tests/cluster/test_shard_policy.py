@@ -52,9 +52,11 @@ def follow(outcomes: list[Outcome]) -> tuple[list[str], ShardFailures, list[floa
         (["cancelled"], "drop"),
     ],
 )
-def test_budgets(outcomes: list[Outcome], last: str) -> None:
-    actions, trouble, _ = follow(outcomes)
+def test_budgets_and_waits_that_double_up_to_a_limit(outcomes: list[Outcome], last: str) -> None:
+    actions, trouble, waits = follow(outcomes)
     assert actions[-1] == last
+    retried = [wait_s for wait_s, action in zip(waits, actions, strict=True) if action == "retry"]
+    assert retried == [0.5, 1, 2, 4, 8, 16, 32, 60, 60][: len(retried)]
     troubles = [o for o in outcomes if o not in ("committed", "superseded", "cancelled")]
     assert [c.split(":")[0] for c in trouble.causes] == troubles
 
@@ -91,16 +93,6 @@ def test_after_two_rounds_of_losses_shards_are_tried_one_at_a_time() -> None:
     assert at_once(100, width=1) == 1
     # Early enough that a shard which takes the others along can be told before the job is ended.
     assert all(not nothing_runs(POLICY, 2 * width, width) for width in range(1, 100))
-
-
-def test_waits_double_up_to_a_limit() -> None:
-    _, _, waits = follow(["lost"] * 9)
-    assert waits == [0.5, 1, 2, 4, 8, 16, 32, 60, 60]
-
-
-def test_what_no_retry_cures_aborts_whatever_the_budget_says() -> None:
-    report = AttemptReport("a", 0, "failed", cause="disk full", ends_job=True)
-    assert decide(POLICY, ShardFailures(), report).action == "abort"
 
 
 def test_deadlines_follow_what_attempts_took() -> None:
