@@ -6,7 +6,6 @@ import errno
 import os
 import resource
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,17 +13,11 @@ import pytest
 from datagen.cluster import attempt
 from datagen.cluster.attempt import run_attempt
 from datagen.cluster.attempt_guard import Meter, guarded
-from datagen.cluster.protocol import JobCannotContinue, ShardTask
+from datagen.cluster.protocol import AttemptReport, JobCannotContinue, ShardTask
 from datagen.schemas.record_files import commit_copy_key, commit_key, shard_folder
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
-from datagen.schemas.specification import (
-    CandidateParams,
-    ObservationParams,
-    SceneParams,
-    Source,
-    Specification,
-)
+from datagen.schemas.specification import CandidateParams, Source, Specification
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
 from tests.made_runs import check_digests, make_run, small_spec
@@ -46,24 +39,25 @@ def test_a_run_or_sources_that_cannot_be_opened_end_the_job(tmp_path: Path) -> N
 def spec() -> Specification:
     """Two clutter objects and few points on the built-in world: small, but the whole path."""
     houses, objects = open_houses("builtin"), open_objects("builtin")
-    return Specification(
-        houses=Source(kind=houses.kind, digest=houses.digest),
-        objects=Source(kind=objects.kind, digest=objects.digest),
-        scene=SceneParams(n_clutter=2),
-        observation=ObservationParams(n_points=256),
-        candidates=CandidateParams(per_scene=5),
-    )
+    sources = {
+        "houses": Source(kind=houses.kind, digest=houses.digest),
+        "objects": Source(kind=objects.kind, digest=objects.digest),
+    }
+    few = CandidateParams(per_scene=5)
+    return small_spec(n_points=256, candidates=few).model_copy(update=sources)
 
 
-def task_on(run: Run, name: str, shard: int = 0) -> ShardTask:
-    return ShardTask(
-        run.storage.url, run.manifest.spec, run.layout, shard, name, "builtin", "builtin", deadline_s=300
+def attempt_at(run: Run, name: str = "a", notes: str = "") -> AttemptReport:
+    """How an attempt at the first shard ends."""
+    task = ShardTask(
+        run.storage.url, run.manifest.spec, run.layout, 0, name, "builtin", "builtin", 300, notes
     )
+    return guarded(run_attempt, task, deadline=False)
 
 
 def test_an_attempt_commits_and_a_second_one_is_superseded(spec: Specification, tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", scenes_per_shard=2, candidates_per_scene=5, shards=(), spec=spec)
-    first, second = (guarded(run_attempt, task_on(run, name), deadline=False) for name in ("first", "second"))
+    run = make_run(tmp_path / "run", shards=(), spec=spec)
+    first, second = (attempt_at(run, name) for name in ("first", "second"))
     assert (first.outcome, second.outcome) == ("committed", "superseded"), first.stack + second.stack
     commit = run.commit_of(0)
     assert commit.attempt == "first" and commit.cost == first.cost and commit.positives == first.positives
@@ -73,16 +67,6 @@ def test_an_attempt_commits_and_a_second_one_is_superseded(spec: Specification, 
     assert run.storage.get(commit_copy_key(0, "first"), 10**8) == run.storage.get(commit_key(0), 10**8)
     # One that comes too late makes nothing.
     assert list(run.storage.list(shard_folder(0, "second"))) == []
-
-
-def test_a_shard_made_twice_is_the_same_bytes(spec: Specification, tmp_path: Path) -> None:
-    files: list[dict[str, str]] = []
-    for name in ("here", "there"):
-        run = make_run(tmp_path / name, scenes_per_shard=2, candidates_per_scene=5, shards=(), spec=spec)
-        report = guarded(run_attempt, task_on(run, name), deadline=False)
-        assert report.outcome == "committed", report.stack
-        files.append({entry.path: entry.sha256 for entry in run.commit_of(0).files})
-    assert files[0] == files[1]
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount a small disk to fill")
@@ -95,8 +79,8 @@ def test_a_full_disk_ends_the_job_and_commits_nothing(spec: Specification, tmp_p
     if mounted.returncode != 0:
         pytest.skip("mounting a small disk is not allowed here")
     try:
-        run = make_run(disk / "run", scenes_per_shard=2, candidates_per_scene=5, shards=(), spec=spec)
-        report = guarded(run_attempt, task_on(run, "a"), deadline=False)
+        run = make_run(disk / "run", shards=(), spec=spec)
+        report = attempt_at(run)
         assert report.ends_job and "No space left on device" in report.cause
         assert "Free disk space" in report.cause and "\n" not in report.cause
         assert run.committed() == set()
@@ -111,26 +95,25 @@ def test_a_full_disk_ends_the_job_and_commits_nothing(spec: Specification, tmp_p
 def test_a_disk_that_is_full_while_scenes_are_made_ends_the_job(
     code: int, ends_job: bool, spec: Specification, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = make_run(tmp_path / "run", scenes_per_shard=2, candidates_per_scene=5, shards=(), spec=spec)
+    run = make_run(tmp_path / "run", shards=(), spec=spec)
 
     def full(*arguments: object) -> None:
         raise OSError(code, os.strerror(code), str(tmp_path / "arm.urdf"))
 
     monkeypatch.setattr(attempt, "run_shard", full)
-    report = guarded(run_attempt, task_on(run, "a"), deadline=False)
+    report = attempt_at(run)
     assert report.outcome == "failed" and report.ends_job == ends_job and "arm" in report.cause
 
 
 def test_a_limit_of_file_sizes_ends_the_job_as_a_full_disk_does(spec: Specification, tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", scenes_per_shard=2, candidates_per_scene=5, shards=(), spec=spec)
+    run = make_run(tmp_path / "run", shards=(), spec=spec)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    notes = replace(task_on(run, "b"), notes=str(tmp_path / "notes"))
     try:
         # Records fit, and chunks do not; then not even the note of an attempt.
         resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
-        large = guarded(run_attempt, task_on(run, "a"), deadline=False)
+        large = attempt_at(run)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
-        small = guarded(run_attempt, notes, deadline=False)
+        small = attempt_at(run, notes=str(tmp_path / "notes"))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     for report in (large, small):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -49,13 +49,10 @@ class Watched:
     """A job of 400 shards on four workers, and what was seen of it."""
 
     summary: JobSummary
-    jobs: WatchedJobs
     closed: dict[str, int]
-    said: Sequence[dict[str, Any]]
-    states: list[tuple[float, JobState]] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.states = [(at_s, state) for at_s, state in self.jobs.states if state.phase == "making"]
+    said: list[dict[str, Any]]
+    looked_s: list[float]
+    states: list[tuple[float, JobState]]
 
 
 def watch(
@@ -71,13 +68,14 @@ def watch(
         events = JobMonitor(recorder, stop, shown, labels_per_shard=10)
         summary = drive(range(400), lambda o: o, executor, books, RetryPolicy(), events, stop, clock)
     said = [json.loads(line) for line in out.getvalue().splitlines()]
-    return Watched(summary, jobs, dict(books.closed), said)
+    states = [(at_s, state) for at_s, state in jobs.states if state.phase == "making"]
+    return Watched(summary, dict(books.closed), said, jobs.looked_s, states)
 
 
 def test_state_is_published_every_ten_seconds_and_requests_are_read_every_three(tmp_path: Path) -> None:
     job = watch(tmp_path)
     assert job.summary.end == "complete" and {line["event"] for line in job.said} == {"progress"}
-    for times, step_s in (([at_s for at_s, _ in job.states], 10), (job.jobs.looked_s, 3)):
+    for times, step_s in (([at_s for at_s, _ in job.states], 10), (job.looked_s, 3)):
         gaps = [b - a for a, b in pairwise(times)]
         assert min(gaps) >= step_s and max(gaps) <= step_s + 1
     done = [state.done for _, state in job.states]
@@ -97,18 +95,19 @@ def test_a_request_drains_the_job_and_is_published_at_once(tmp_path: Path) -> No
     assert 30 <= stopping_s <= 34 and job.states[-1][1].stopping == "asked to stop"
 
 
-@pytest.mark.parametrize("drains_first", [False, True])
-def test_a_request_to_stop_at_once_kills_attempts_in_flight(tmp_path: Path, drains_first: bool) -> None:
-    def requested(now_s: float) -> Stop | None:
-        return "now" if now_s >= 33 else "drain" if drains_first and now_s >= 30 else None
-
-    job = watch(tmp_path, requested)
-    assert job.summary.end == "interrupted" and job.closed["cancelled"] > 0
-
-
-def test_a_request_to_drain_after_a_ctrl_c_is_not_a_second_ctrl_c(tmp_path: Path) -> None:
-    job = watch(tmp_path, lambda now_s: "drain", asked=1)
-    assert job.summary.end == "interrupted" and "cancelled" not in job.closed
+@pytest.mark.parametrize(
+    ("requested", "asked", "cancels"),
+    [
+        (lambda now_s: "now" if now_s >= 33 else None, 0, True),
+        (lambda now_s: "now" if now_s >= 33 else "drain" if now_s >= 30 else None, 0, True),
+        (lambda now_s: "drain", 1, False),  # is not a second Ctrl-C
+    ],
+)
+def test_a_request_to_stop_at_once_kills_attempts_in_flight_and_one_to_drain_after_a_ctrl_c_does_not(
+    tmp_path: Path, requested: Callable[[float], Stop | None], asked: int, cancels: bool
+) -> None:
+    job = watch(tmp_path, requested, asked)
+    assert job.summary.end == "interrupted" and ("cancelled" in job.closed) == cancels
 
 
 def thirty_seconds(as_json: bool) -> list[str]:
@@ -127,15 +126,12 @@ def thirty_seconds(as_json: bool) -> list[str]:
     return out.getvalue().splitlines()
 
 
-def test_json_lines_come_at_intervals_and_for_each_failure() -> None:
+def test_lines_come_at_intervals_and_for_each_failure_as_json_and_as_text() -> None:
     said = [json.loads(line) for line in thirty_seconds(as_json=True)]
     assert [s["event"] for s in said] == ["progress"] * 3 + ["attempt_crashed", "stopping", "progress"]
     assert said[2]["shards_done"] == 80 and said[2]["shards"] == 150
     assert said[2]["labels_per_s"] == 60.0 and said[2]["left_s"] == 70
     assert said[3]["shard"] == 5 and said[3]["action"] == "retry"
-
-
-def test_lines_of_text_have_the_same_figures() -> None:
     assert thirty_seconds(as_json=False)[2:] == [
         "shards 80/150  60 labels/s  0:01:10 left  0 retries  0.00 core-h",
         "shard 5 crashed: Fatal Python error: Segmentation fault (retry)",

@@ -20,6 +20,7 @@ def summary(end: End, cause: str = "", committed: int = 1) -> JobSummary:
         (("interrupted", "failed"), "interrupted", 130),
         (("aborted", "interrupted", "failed"), "aborted", 2),
         (("complete", "complete"), "complete", 0),
+        ((), "complete", 0),
     ],
 )
 def test_a_job_over_several_runs_ends_as_the_worst_of_them(
@@ -30,13 +31,9 @@ def test_a_job_over_several_runs_ends_as_the_worst_of_them(
         assert (whole.end, whole.exit_code) == (worst, code)
 
 
-def test_the_first_cause_of_the_worst_end_is_told() -> None:
-    parts = [summary("failed", "many"), summary("aborted", "disk"), summary("aborted", "gone")]
-    assert reduce(JobSummary.plus, parts).cause == "disk"
-
-
-def test_sums_are_over_all_runs() -> None:
-    whole = empty_summary().plus(summary("complete", committed=3)).plus(summary("interrupted", committed=1))
-    assert (whole.totals.shards, whole.totals.committed, whole.totals.labels) == (6, 4, 40)
-    assert (whole.remaining, whole.elapsed_s) == (2, 4.0)
-    assert (empty_summary().remaining, empty_summary().exit_code) == (0, 0)
+def test_the_first_cause_of_the_worst_end_is_told_and_sums_are_over_all_runs() -> None:
+    parts = [summary("failed", "many", 3), summary("aborted", "disk"), summary("aborted", "gone", 0)]
+    whole = reduce(JobSummary.plus, parts, empty_summary())
+    assert whole.cause == "disk"
+    assert (whole.totals.shards, whole.totals.committed, whole.totals.labels) == (9, 4, 40)
+    assert (whole.remaining, whole.elapsed_s) == (5, 6.0)

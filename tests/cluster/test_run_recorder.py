@@ -6,15 +6,10 @@ from pathlib import Path
 
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.shard_policy import ShardFailures
-from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, LedgerEntry
 from tests.made_runs import make_run, write
 
 TROUBLE = ShardFailures(attempts=("a", "b"), causes=("failed: x", "hung: y"), stacks=("at x", ""))
-
-
-def ends(run: Run) -> dict[str, LedgerEntry]:
-    return {entry.attempt: entry for entry in run.ledger.ends()}
 
 
 def test_attempts_of_a_killed_driver_are_closed_once_their_shards_are_decided(tmp_path: Path) -> None:
@@ -25,51 +20,27 @@ def test_attempts_of_a_killed_driver_are_closed_once_their_shards_are_decided(tm
     run.commit(write(run, 1, "won-one"))
     RunRecorder(run).quarantine(3, TROUBLE)
     # Nobody knows yet whether the orphan will reach its commit.
+    starts = {start.attempt: start for start in run.ledger.unfinished()}
     assert close_lost_attempts(run) == 3 and close_lost_attempts(run) == 0
     assert [start.attempt for start in run.ledger.unfinished()] == ["orphan"]
     run.commit(write(run, 2, "orphan"))
     assert close_lost_attempts(run) == 1
-    told = {name: (entry.outcome, entry.shard) for name, entry in ends(run).items()}
-    assert told == {
+    ends = {entry.attempt: entry for entry in run.ledger.ends()}
+    assert {name: (entry.outcome, entry.shard) for name, entry in ends.items()} == {
         "lost-one": ("lost", 0), "won-one": ("committed", 1), "orphan": ("committed", 2),
         "hopeless": ("lost", 3),
     }  # fmt: skip
-
-
-def test_a_closed_attempt_has_all_that_is_known(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", shards=())
-    for attempt, shard in (("lost", 0), ("won", 1)):
-        run.ledger.start(attempt, shard)
-    run.commit(write(run, 0, "other"))
-    run.commit(write(run, 1, "won"))
-    starts = {start.attempt: start for start in run.ledger.unfinished()}
-    close_lost_attempts(run)
-    commit, found = run.commit_of(1), ends(run)
-    assert found["won"] == LedgerEntry(
-        attempt="won",
-        shard=1,
-        outcome="committed",
-        started=starts["won"].started,
-        ended=commit.created,
-        cost=commit.cost,
-        host=commit.host,
-    )
-    lost = found["lost"]
+    # They have all that is known.
+    commit, won, lost = run.commit_of(1), ends["won-one"], ends["lost-one"]
+    assert (won.cost, won.host) == (commit.cost, commit.host)
+    assert (won.started, won.ended) == (starts["won-one"].started, commit.created)
     assert lost.cause == "it left no end record, and its shard was decided without it"
-    assert (lost.cost, lost.host, lost.started) == (None, None, starts["lost"].started)
+    assert (lost.cost, lost.host, lost.started) == (None, None, starts["lost-one"].started)
     assert lost.ended >= lost.started > ""
-
-
-def test_a_shard_in_quarantine_can_be_run_alone(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", shards=())
-    RunRecorder(run).quarantine(3, TROUBLE)
-    (record,) = run.quarantine_records()
+    (record,) = run.quarantine_records()  # with which the shard can be run alone
     assert (record.shard, record.seed, record.first_scene, record.scenes) == (3, 0, 6, 2)
-    assert (record.attempts, record.causes, record.stacks) == (
-        TROUBLE.attempts,
-        TROUBLE.causes,
-        TROUBLE.stacks,
-    )
+    assert (record.attempts, record.causes) == (TROUBLE.attempts, TROUBLE.causes)
+    assert record.stacks == TROUBLE.stacks
 
 
 def test_an_attempt_taken_for_lost_replaces_that_by_its_own_account(tmp_path: Path) -> None:
@@ -78,9 +49,8 @@ def test_an_attempt_taken_for_lost_replaces_that_by_its_own_account(tmp_path: Pa
     run.ledger.start("slow", 0)
     run.commit(write(run, 0, "fast"))
     assert close_lost_attempts(run) == 1
-    recorder, cost = RunRecorder(run), Cost(wall_s=7.0, cpu_s=6.0)
     for seconds in (7.0, 9.0):  # an account stands, whoever comes later
-        told = LedgerEntry(attempt="slow", shard=0, outcome="superseded", cost=Cost(wall_s=seconds, cpu_s=6))
-        recorder.close(told)
+        cost = Cost(wall_s=seconds, cpu_s=6)
+        RunRecorder(run).close(LedgerEntry(attempt="slow", shard=0, outcome="superseded", cost=cost))
     (entry,) = run.ledger.ends()
-    assert (entry.outcome, entry.cost) == ("superseded", cost)
+    assert (entry.outcome, entry.cost) == ("superseded", Cost(wall_s=7.0, cpu_s=6.0))

@@ -1,17 +1,108 @@
-"""Drivers of one run beside each other: each shard once, little made twice."""
+"""Several real drivers of one run on a simulated cluster: each shard once, little made twice.
+
+They take turns, in the order of simulated time.
+"""
 
 from __future__ import annotations
 
 import random
+import threading
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.cluster.shard_policy import OpenShards
+from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.protocol import AttemptReport, JobSummary, StopRequest
+from datagen.cluster.shard_policy import OpenShards, RetryPolicy
 from datagen.schemas.run_records import ShardRanges
-from tests.cluster.several_drivers import drive_together, waste
+from tests.cluster.simulated import FakeClock, Fate, Heard, PaperRecorder, SimulatedExecutor
+
+SHARD_S, LOOK_S = 5.0, 0.01
+
+
+class Turns:
+    """Lets one thread at a time run: that whose own clock is furthest behind."""
+
+    def __init__(self, clocks: list[FakeClock]) -> None:
+        self._clocks, self._left = clocks, set(range(len(clocks)))
+        self._changed = threading.Condition()
+
+    def wait_for(self, driver: int) -> None:
+        with self._changed:
+            self._changed.notify_all()
+            self._changed.wait_for(
+                lambda: min(self._left, key=lambda d: (self._clocks[d].now_s, d)) == driver
+            )
+
+    def end(self, driver: int) -> None:
+        with self._changed:
+            self._left.discard(driver)
+            self._changed.notify_all()
+
+
+class Executor(SimulatedExecutor):
+    """One driver's workers; a shard is won by who is through with it first. `done_s`: when each shard is."""
+
+    def __init__(self, done_s: dict[int, float], turns: Turns, driver: int, clock: FakeClock) -> None:
+        super().__init__(clock, self.begin, slots=2)
+        self.done_s, self.turns, self.driver = done_s, turns, driver
+
+    def begin(self, order: AttemptOrder, n: int) -> Fate:
+        if order.shard in self.done_s:  # who began first is through with it first
+            return ("superseded", LOOK_S if self.done_s[order.shard] <= self.clock.now_s else SHARD_S)
+        self.done_s[order.shard] = self.clock.now_s + SHARD_S
+        return ("committed", SHARD_S)
+
+    def wait(self, timeout_s: float) -> list[AttemptReport]:
+        ended = super().wait(timeout_s)
+        self.turns.wait_for(self.driver)
+        return ended
+
+
+class SharedRecorder(PaperRecorder):
+    """The recorder of one driver over what all have committed."""
+
+    def __init__(self, shards: int, done_s: dict[int, float], clock: FakeClock) -> None:
+        super().__init__()
+        self.shards, self.done_s, self.clock = shards, done_s, clock
+
+    def missing(self) -> ShardRanges:
+        done = {shard for shard, at_s in self.done_s.items() if at_s <= self.clock.now_s}
+        return ShardRanges.of(set(range(self.shards)) - done)
+
+
+def drive_together(drivers: int, shards: int) -> list[JobSummary]:
+    """How the jobs of drivers that begin together at one run ended."""
+    clocks = [FakeClock() for _ in range(drivers)]
+    done_s, turns, ended = dict[int, float](), Turns(clocks), dict[int, JobSummary]()
+
+    def one(driver: int) -> None:
+        clock = clocks[driver]
+        executor, recorder = Executor(done_s, turns, driver, clock), SharedRecorder(shards, done_s, clock)
+        try:
+            turns.wait_for(driver)
+            ended[driver] = drive(
+                range(shards), lambda o: o, executor, recorder, RetryPolicy(), Heard(), StopRequest(), clock
+            )
+        finally:
+            turns.end(driver)
+
+    threads = [threading.Thread(target=one, args=(driver,)) for driver in range(drivers)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return [ended[driver] for driver in range(drivers)]
+
+
+def waste(summaries: list[JobSummary]) -> tuple[int, float]:
+    """Attempts that were wasted, and the share of all time that they took."""
+    wasted = sum(summary.totals.outcomes.total() - summary.totals.committed for summary in summaries)
+    useful_s = sum(summary.totals.useful_wall_s for summary in summaries)
+    wasted_s = sum(summary.totals.wasted_wall_s for summary in summaries)
+    return wasted, wasted_s / (useful_s + wasted_s)
 
 
 @given(st.sets(st.integers(0, 80)), st.integers(0, 2**32), st.lists(st.integers(0, 3), max_size=80))
