@@ -5,12 +5,13 @@ from __future__ import annotations
 import heapq
 import random
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.protocol import AttemptReport, JobSummary, JobTotals, StopRequest
+from datagen.cluster.protocol import AttemptReport, JobTotals, StopRequest
 from datagen.cluster.shard_policy import RetryPolicy, ShardFailures
 from datagen.schemas.run_records import Commit, ShardRanges
 from tests.cluster.simulated import FakeClock, Heard, PaperRecorder, commit_by, report_of
@@ -194,32 +195,25 @@ class Silent(Heard):
 
 
 def simulate(
-    shards: int, seed: int, nodes: int = 16, on_tick: object = lambda totals: None
-) -> tuple[JobSummary, BadCluster]:
+    shards: int, seed: int, nodes: int = 16, on_tick: Callable[[JobTotals], None] = lambda totals: None
+) -> BadCluster:
     """Drive the shards to their end and check the result against the cluster's own count."""
     clock = FakeClock()
     cluster = BadCluster(clock, shards, seed, nodes)
-    heard = Silent(on_tick=on_tick)  # type: ignore[arg-type]
+    silent = Silent(on_tick=on_tick)
     summary = drive(
-        range(shards), lambda o: o, cluster, cluster.recorder, RetryPolicy(), heard, StopRequest(), clock
+        range(shards), lambda o: o, cluster, cluster.recorder, RetryPolicy(), silent, StopRequest(), clock
     )
-    check(summary, cluster, shards)
-    return summary, cluster
-
-
-def check(summary: JobSummary, cluster: BadCluster, shards: int) -> None:
-    """Every shard is done once or given up; the totals is what the cluster counted."""
-    totals: JobTotals = summary.totals
-    done = np.frombuffer(cluster.done, np.uint8)
+    # Every shard is done once or given up, and the totals are what the cluster counted.
+    totals, given_up, done = summary.totals, cluster.recorder.given_up, np.frombuffer(cluster.done, np.uint8)
     assert summary.end == "complete" and summary.remaining == 0
-    assert int(done.max()) == 1 and int(done.sum()) + len(cluster.recorder.given_up) == shards
-    assert not any(done[shard] for shard in cluster.recorder.given_up)
-    assert cluster.poisoned <= set(cluster.recorder.given_up) and totals.quarantined == len(
-        cluster.recorder.given_up
-    )
+    assert int(done.max()) == 1 and int(done.sum()) + len(given_up) == shards
+    assert not any(done[shard] for shard in given_up)
+    assert cluster.poisoned <= set(given_up) and totals.quarantined == len(given_up)
     assert totals.outcomes == cluster.outcomes == cluster.recorder.closed
     assert totals.committed == cluster.outcomes["committed"] and totals.labels == 10 * totals.committed
     assert totals.superseded == cluster.outcomes["superseded"]
     assert totals.committed + totals.superseded + totals.elsewhere == int(done.sum())
     for said, counted in ((totals.useful_wall_s, cluster.useful_s), (totals.wasted_wall_s, cluster.wasted_s)):
         assert abs(said - counted) <= 1e-9 * counted + 1e-6
+    return cluster
