@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -76,3 +78,19 @@ def drawn_tables(
         base_xy_m=torch.tensor(rng.uniform(-0.9, 0.9, (candidates, 2)), dtype=torch.float32),
     )
     return clouds, of_candidates, of_robots
+
+
+def turned_about_z(tables: Tables, angle: float) -> Tables:
+    clouds, candidates, robots = tables
+    c, s = math.cos(angle), math.sin(angle)
+    turn = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    points = (clouds.points_m.double() @ turn.T).float()
+    base = (candidates.base_xy_m.double() @ turn[:2, :2].T).float()
+    return replace(clouds, points_m=points), replace(candidates, base_xy_m=base), robots
+
+
+def mirrored(tables: Tables) -> Tables:
+    clouds, candidates, robots = tables
+    flip = torch.tensor([1.0, -1.0, 1.0])
+    base = candidates.base_xy_m * flip[:2]
+    return replace(clouds, points_m=clouds.points_m * flip), replace(candidates, base_xy_m=base), robots

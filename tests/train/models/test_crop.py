@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from datagen.train.models.crop import ball_query, crop_clouds, farthest_points, first_true, gather_rows
+from datagen.train.models.crop import ball_query, crop_clouds, farthest_points
 from datagen.workers.rendering.cloud import farthest_points as stored_order
 from tests.train.models.made_batches import drawn_tables
 
@@ -46,35 +46,14 @@ def test_points_that_are_not_finite_are_left_out(bad: float):
     assert int(crop.valid[0].sum()) == 95
 
 
-def test_clouds_without_room_for_points_give_empty_crops():
-    clouds, _, robots = drawn_tables(0, points=0)
-    crop = crop_clouds(clouds, robots, 8)
-    assert crop.points_m.shape == (3, 8, 3)
-    assert not crop.valid.any()
-
-
-def test_first_true_lists_the_first_true_entries():
-    mask = torch.tensor([[0, 1, 1, 0, 1], [0, 0, 0, 0, 0], [1, 1, 1, 1, 1]], dtype=torch.bool)
-    rows, found = first_true(mask, 2)
-    assert rows.tolist() == [[1, 2], [0, 0], [0, 1]]
-    assert found.tolist() == [[True, True], [False, False], [True, True]]
-    rows, found = first_true(mask[:1], 4)
-    assert rows.tolist() == [[1, 2, 4, 0]]
-    assert found.tolist() == [[True, True, True, False]]
-
-
-def test_farthest_points_are_those_of_the_stored_order():
+def test_farthest_points_are_those_of_the_stored_order_and_repeated_where_there_are_fewer():
     points = np.random.default_rng(0).normal(size=(3, 50, 3)).astype(np.float32)
-    valid = torch.arange(50) < torch.tensor([[50], [50], [20]])
+    valid = torch.arange(50) < torch.tensor([[50], [20], [3]])
     rows = farthest_points(torch.tensor(points), valid, 16)
-    for cloud, n, ours in zip(points, (50, 50, 20), rows, strict=True):
-        np.testing.assert_array_equal(ours, stored_order(cloud[:n], 16))
-
-
-def test_a_cloud_of_fewer_points_repeats_them():
-    rows = farthest_points(torch.randn(1, 9, 3), torch.arange(9)[None] < 3, 8)
-    assert sorted(rows[0, :3].tolist()) == [0, 1, 2]
-    assert set(rows[0].tolist()) == {0, 1, 2}
+    for cloud, n, ours in zip(points, (50, 20, 3), rows, strict=True):
+        first = min(n, 16)
+        np.testing.assert_array_equal(ours[:first], stored_order(cloud[:n], first))
+        assert set(ours.tolist()) == set(ours[:first].tolist())
 
 
 def test_a_ball_holds_the_first_points_within_its_radius():
@@ -90,12 +69,3 @@ def test_a_ball_holds_the_first_points_within_its_radius():
             assert found[b, j] == len(want)
             filled = [*want, *[want[0] if len(want) else 0] * (6 - len(want))]
             assert rows[b, j].tolist() == filled
-
-
-def test_gather_rows_takes_rows_of_any_shape():
-    values = torch.arange(24.0).reshape(2, 4, 3)
-    rows = torch.tensor([[[0, 3], [1, 1]], [[2, 2], [0, 1]]])
-    taken = gather_rows(values, rows)
-    assert taken.shape == (2, 2, 2, 3)
-    assert torch.equal(taken[1, 0, 1], values[1, 2])
-    assert torch.equal(taken[0, 0, 1], values[0, 3])

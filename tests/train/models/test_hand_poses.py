@@ -55,15 +55,11 @@ def test_hands_across_the_narrow_side_hold_it_clear_of_the_table():
     assert (approach[:, 2] < 0.2).all()
     assert (measures[across, TIPS] > 0).all()
     assert (np.linalg.norm(tcp, axis=1) < 0.2).all()
+    for axis in (approach, closing):
+        np.testing.assert_allclose(np.linalg.norm(axis, axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose((approach * closing).sum(1), 0, atol=1e-5)
     # Some hold no more than a wall of it.
     assert abs(float(np.median(measures[across, WIDTH])) - 20 * HALF_M[0]) < 0.15
-
-
-def test_axes_are_of_length_one_and_square():
-    _, _, approach, closing = parts(hand_poses(table(), box(), COUNT))
-    np.testing.assert_allclose(np.linalg.norm(approach, axis=1), 1, atol=1e-5)
-    np.testing.assert_allclose(np.linalg.norm(closing, axis=1), 1, atol=1e-5)
-    np.testing.assert_allclose((approach * closing).sum(1), 0, atol=1e-5)
 
 
 def test_a_wall_takes_the_room_of_hands_from_its_side_alone():

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.schemas.errors import InputError
 from datagen.train.models import Model
 from datagen.train.models.n2m import _log_chances, _log_rate
-from datagen.train.training.checkpoints import Checkpoint, CheckpointHead, load_model, write_checkpoint
-from tests.train.models.made_batches import drawn_tables, small_model
-from tests.train.models.test_shared import turned_about_z
+from tests.train.models.made_batches import drawn_tables, mirrored, small_model, turned_about_z
 
 
 @pytest.fixture(scope="module")
@@ -29,13 +23,8 @@ def model() -> Model:
 def test_turning_and_mirroring_the_scene_changes_nothing(model: Model, angle: float, seed: int):
     tables = drawn_tables(seed)
     logits = model.score(*tables)
-    turned = turned_about_z(tables, angle)
-    torch.testing.assert_close(model.score(*turned), logits, atol=1e-3, rtol=1e-3)
-    clouds, candidates, robots = tables
-    flip = torch.tensor([1.0, -1.0, 1.0])
-    clouds = replace(clouds, points_m=clouds.points_m * flip)
-    candidates = replace(candidates, base_xy_m=candidates.base_xy_m * flip[:2])
-    torch.testing.assert_close(model.score(clouds, candidates, robots), logits, atol=1e-3, rtol=1e-3)
+    for same in (turned_about_z(tables, angle), mirrored(tables)):
+        torch.testing.assert_close(model.score(*same), logits, atol=1e-3, rtol=1e-3)
 
 
 @torch.no_grad()
@@ -58,20 +47,3 @@ def test_a_rate_is_the_mixtures_density_times_its_mass():
     # A component of weight w has mass 2 pi exp(w) times the square of the first standard deviation.
     mass = 2 * torch.pi * 0.3**2 * mixture[0, 0, :, 0].exp().sum()
     torch.testing.assert_close(rate.sum() * float(side[1] - side[0]) ** 2, mass, rtol=1e-3, atol=0)
-
-
-def test_checkpoints_come_back_and_those_of_other_weights_are_refused(model: Model, tmp_path: Path):
-    head = CheckpointHead(
-        model="n2m", model_config=model.config, stage="sim-only", options={}, data=(), val_data=(),
-        house_ids=(), object_digests=(), val_house_ids=(), cost={}, versions={}, history=(),
-    )  # fmt: skip
-    weights = dict(model.state_dict())
-    write_checkpoint(tmp_path / "good.ckpt", Checkpoint(head, weights))
-    again, _ = load_model(tmp_path / "good.ckpt")
-    with torch.no_grad():
-        assert torch.equal(again.score(*drawn_tables(1)), model.score(*drawn_tables(1)))
-    wrong = {**weights, "mixture.bias": weights["mixture.bias"][:-6]}
-    write_checkpoint(tmp_path / "bad.ckpt", Checkpoint(head, wrong))
-    with pytest.raises(InputError, match=r"mixture\.bias") as caught:
-        load_model(tmp_path / "bad.ckpt")
-    assert "\n" not in str(caught.value)
