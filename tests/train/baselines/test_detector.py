@@ -11,7 +11,7 @@ import pytest
 from datagen.schemas.errors import InputError
 from datagen.train.baselines import make_baselines
 from datagen.train.baselines.baseline import is_feasible
-from datagen.train.baselines.detector import Detections, ZeroShotDetector, render_views
+from datagen.train.baselines.detector import Detections, ZeroShotDetector, render_views, spoken_name
 from tests.train.baselines.scenes import make_batch
 
 
@@ -75,13 +75,16 @@ def test_the_detector_sees_feasible_candidates_alone(folder: Path) -> None:
 def test_a_folder_without_a_detector_gives_one_line(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"config\.json"):
         ZeroShotDetector(tmp_path / "missing")
-    (tmp_path / "config.json").write_text('{"model_type": "bert"}')
-    with pytest.raises(InputError, match="save_pretrained") as caught:
-        ZeroShotDetector(tmp_path)
-    assert "\n" not in str(caught.value)
-    (tmp_path / "config.json").write_text("{")
-    with pytest.raises(InputError, match="save_pretrained"):
-        ZeroShotDetector(tmp_path)
+    for text in ('{"model_type": "bert"}', "{"):
+        (tmp_path / "config.json").write_text(text)
+        with pytest.raises(InputError, match="save_pretrained") as caught:
+            ZeroShotDetector(tmp_path)
+        assert "\n" not in str(caught.value)
+
+
+def test_object_names_become_words() -> None:
+    names = ("003_cracker_box", "mug", "063-a_marbles", "077")
+    assert [spoken_name(name) for name in names] == ["cracker box", "mug", "a marbles", "077"]
 
 
 def test_the_box_around_the_middle_counts() -> None:
