@@ -1,6 +1,8 @@
-"""Candidates: the grid, its random subset, places that are clear or in range, and the robots on them."""
+"""Candidates: the grid, its random subset, places clear or in range as by a simple draw, and the robots."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,14 +10,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.schemas.specification import CandidateParams
-from datagen.workers.bases.candidates import SceneCandidates, distances, draw_candidates, grid_offsets
-from datagen.workers.bases.clearance import base_clearance_m, obstacles_of
-from tests.workers.worlds import ROOM_M, TABLE_TOP_M, table_house
+from datagen.workers.bases.candidates import (
+    DRAWS_A_ROBOT,
+    ROUNDS,
+    SceneCandidates,
+    distances,
+    draw_candidates,
+    grid_offsets,
+)
+from datagen.workers.bases.clearance import Obstacles, base_clearance_m, obstacles_of
+from datagen.workers.houses.house import StaticBody
+from tests.workers.worlds import ROOM_M, TABLE_SIZE_M, TABLE_TOP_M, box_body, table_house
 
-TARGET = np.array([ROOM_M[0] / 2 - 0.35, ROOM_M[1] / 2 - 0.2, TABLE_TOP_M + 0.05])  # near a corner
+MIDDLE = (ROOM_M[0] / 2, ROOM_M[1] / 2)
+TARGET = np.array([MIDDLE[0] - 0.35, MIDDLE[1] - 0.2, TABLE_TOP_M + 0.05])  # near a corner
 OBSTACLES = obstacles_of(table_house())
 SAME_HEIGHTS = {"camera_height_m": {"low": 1.2, "high": 1.2}, "base_height_m": {"low": 0.7, "high": 0.7}}
-FAR_ARMS = {"low": 0.8, "high": 1.0}
 
 
 def draw(seed: int = 0, **params: object) -> SceneCandidates:
@@ -25,20 +35,11 @@ def draw(seed: int = 0, **params: object) -> SceneCandidates:
     return found
 
 
-def cells_of(candidates: SceneCandidates) -> np.ndarray:
-    """The grid cell (N, 2) that each candidate stands in."""
-    return np.rint((candidates.base_xy_m.astype(np.float64) - TARGET[:2]) * 12)
-
-
-def test_the_grid_spans_a_metre_each_way_and_holds_every_cell_once() -> None:
+def test_the_whole_grid_of_a_metre_each_way_is_taken_in_order_and_without_jitter() -> None:
     offsets = grid_offsets(CandidateParams())
     assert len({tuple(o) for o in offsets.round(9)}) == 625
     np.testing.assert_allclose([offsets.min(0), offsets.max(0)], [[-1, -1], [1, 1]])
-
-
-def test_the_whole_grid_is_taken_in_order_and_without_jitter() -> None:
-    candidates = draw(per_scene="grid")
-    np.testing.assert_allclose(candidates.base_xy_m, TARGET[:2] + grid_offsets(CandidateParams()), atol=1e-6)
+    np.testing.assert_allclose(draw(per_scene="grid").base_xy_m, TARGET[:2] + offsets, atol=1e-6)
 
 
 @given(st.integers(0, 2**32), st.integers(1, 625))
@@ -53,18 +54,15 @@ def test_a_subset_keeps_within_half_a_cell_of_different_cells(seed: int, n: int)
     assert len({tuple(row) for row in unjittered}) == n
 
 
-def test_robots_are_shared_out_evenly_and_keep_their_numbers() -> None:
+def test_robots_are_shared_out_evenly_and_keep_their_numbers_or_each_candidate_has_its_own() -> None:
     candidates = draw(per_scene=60, robots_per_scene=4)
     assert np.bincount(candidates.robot_index).tolist() == [15] * 4
     for robot in range(4):
         rows = candidates.robot_index == robot
         for column in (candidates.camera_height_m, candidates.base_height_m, candidates.arm_reach_m):
             assert len(set(column[rows].tolist())) == 1
-
-
-def test_one_robot_a_candidate_is_the_papers_draw() -> None:
-    candidates = draw(per_scene=60, robot_per_candidate=True)
-    assert len(set(candidates.arm_reach_m.tolist())) == 60
+    each_its_own = draw(per_scene=60, robot_per_candidate=True)
+    assert len(set(each_its_own.arm_reach_m.tolist())) == 60
 
 
 @given(st.integers(0, 2**32))
@@ -88,41 +86,6 @@ def test_distances_are_planar_and_from_the_mount() -> None:
     np.testing.assert_allclose(mount**2, planar**2 + (TARGET[2] - candidates.base_height_m) ** 2, rtol=1e-5)
 
 
-def test_clearance_is_that_of_the_robot_where_it_stands() -> None:
-    for candidates in (draw(per_scene="grid"), draw(per_scene=60), draw(per_scene=60, within="clear")):
-        alone = [
-            base_clearance_m(
-                candidates.base_xy_m[k : k + 1],
-                candidates.base_height_m[k : k + 1],
-                candidates.camera_height_m[k : k + 1],
-                np.array([0.25]),
-                OBSTACLES,
-                0.05,
-            )[0]
-            for k in range(0, len(candidates), 7)
-        ]
-        np.testing.assert_array_equal(candidates.clearance_m[::7], alone)
-
-
-@given(st.integers(0, 2**32), st.integers(1, 60), st.integers(1, 5))
-@settings(max_examples=30, deadline=None)
-def test_clear_candidates_are_clear_and_stand_in_different_cells(seed: int, n: int, robots: int) -> None:
-    candidates = draw(seed, per_scene=n, within="clear", robots_per_scene=robots)
-    assert len(candidates) == n and (candidates.clearance_m >= 0).all()
-    assert (candidates.robot_index == np.arange(n) % robots).all()
-    assert len({tuple(cell) for cell in cells_of(candidates)}) == n
-    again = draw(seed, per_scene=n, within="clear", robots_per_scene=robots)
-    np.testing.assert_array_equal(candidates.base_xy_m, again.base_xy_m)
-
-
-@given(st.integers(0, 2**32))
-@settings(max_examples=20, deadline=None)
-def test_candidates_in_range_are_clear_and_within_reach_of_their_robot(seed: int) -> None:
-    candidates = draw(seed, per_scene=24, within="in-range", arm_reach_m=FAR_ARMS)
-    assert (candidates.clearance_m >= 0).all()
-    assert (distances(candidates, TARGET)[1] <= candidates.arm_reach_m).all()
-
-
 def test_the_places_of_clear_candidates_are_spread_as_the_clear_cells_are() -> None:
     drawn = np.concatenate(
         [draw(seed, per_scene=40, within="clear", **SAME_HEIGHTS).base_xy_m for seed in range(40)]
@@ -131,19 +94,6 @@ def test_the_places_of_clear_candidates_are_spread_as_the_clear_cells_are() -> N
     clear = grid.base_xy_m[grid.clearance_m >= 0]
     np.testing.assert_allclose(drawn.mean(0), clear.mean(0), atol=0.05)
     np.testing.assert_allclose(drawn.std(0), clear.std(0), atol=0.05)
-
-
-def test_cells_repeat_only_where_too_few_are_clear() -> None:
-    # A base almost as wide as the way between table and wall: few cells are clear.
-    wide = {"base_radius_m": 0.43, "jitter": False, **SAME_HEIGHTS}
-    grid = draw(per_scene="grid", **wide)
-    clear = int((grid.clearance_m >= 0).sum())
-    assert 10 < clear < 300
-    few = draw(per_scene=clear, within="clear", robots_per_scene=1, **wide)
-    assert len({tuple(cell) for cell in cells_of(few)}) == clear
-    many = draw(per_scene=2 * clear, within="clear", robots_per_scene=1, **wide)
-    cells = [tuple(cell) for cell in cells_of(many)]
-    assert {cells.count(cell) for cell in cells} == {2}
 
 
 @pytest.mark.parametrize(
@@ -170,3 +120,92 @@ def test_reaches_are_whole_steps_within_their_range(seed: int, low: float, width
     assert (reach_m >= low - 1e-6).all() and (reach_m <= low + width + 1e-6).all()
     inside = (reach_m > low + 1e-6) & (reach_m < low + width - 1e-6)
     np.testing.assert_allclose(reach_m[inside] * 100, np.round(reach_m[inside] * 100), atol=1e-4)
+
+
+def cupboard(side: int, gap_m: float, depth_m: float = 0.4) -> StaticBody:
+    """A cupboard along one side of the table."""
+    along = side % 2
+    off = (TABLE_SIZE_M[1 - along] / 2 + gap_m + depth_m / 2) * (1 if side < 2 else -1)
+    centre = (MIDDLE[0] + off, MIDDLE[1]) if along else (MIDDLE[0], MIDDLE[1] + off)
+    size = (depth_m, 1.2) if along else (1.4, depth_m)
+    return box_body(f"cupboard|{side}", "furniture", "Cabinet", (*size, 1.0), (*centre, 0.5))
+
+
+def plain_candidates(
+    target_m: np.ndarray, obstacles: Obstacles, params: CandidateParams, rng: np.random.Generator
+) -> SceneCandidates | None:
+    """`draw_candidates` in its simplest form: every robot at every position of every round."""
+    n, n_robots = params.count, min(params.robots_per_scene, params.count)
+    draws = DRAWS_A_ROBOT * n_robots
+    camera_m, mount_m, reach_m = (
+        rng.uniform(r.low, r.high, draws).astype(np.float32)
+        for r in (params.camera_height_m, params.base_height_m, params.arm_reach_m)
+    )
+    cells = grid_offsets(params)
+    orders = np.concatenate([rng.permutation(len(cells)) for _ in range(ROUNDS)])
+    half_m = params.grid_half_width_m / (params.grid_cells - 1)
+    jitter_m = rng.uniform(-half_m, half_m, (len(orders), 2))
+    xy_m = (target_m[:2] + (cells[orders] + jitter_m)).astype(np.float32)
+    free = np.ones(len(xy_m), np.bool_)
+    rows = np.empty(n, np.int64)
+    robots: list[int] = []
+    for k in range(draws):
+        camera, mount, reach = (np.full(len(xy_m), v[k]) for v in (camera_m, mount_m, reach_m))
+        radius_m = params.radius_of_base_m(reach)
+        clearance_m = base_clearance_m(xy_m, mount, camera, radius_m, obstacles, params.mast_radius_m)
+        there = SceneCandidates(xy_m, np.zeros(len(xy_m), np.int16), camera, mount, reach, clearance_m)
+        inside = clearance_m >= 0
+        if params.within == "in-range":
+            inside &= distances(there, target_m)[1] <= reach
+        own = np.arange(n) % n_robots == len(robots)
+        found = np.flatnonzero(inside & free)[: own.sum()]
+        if len(found) < own.sum():
+            continue
+        rows[own], free[found] = found, False
+        robots.append(k)
+        if len(robots) == n_robots:
+            index = (np.arange(n) % n_robots).astype(np.int16)
+            robot = np.array(robots)[index]
+            heights = (camera_m[robot], mount_m[robot])
+            radius_m = params.radius_of_base_m(reach_m[robot])
+            clearance_m = base_clearance_m(
+                xy_m[rows], heights[1], heights[0], radius_m, obstacles, params.mast_radius_m
+            )
+            return SceneCandidates(xy_m[rows], index, *heights, reach_m[robot], clearance_m)
+    return None
+
+
+@given(
+    st.integers(0, 2**32),
+    st.sampled_from(("in-range", "clear")),
+    st.booleans(),
+    st.integers(1, 40),
+    st.integers(1, 4),
+    st.data(),
+)
+@settings(max_examples=20, deadline=None)
+def test_candidates_with_within_are_those_of_trying_every_robot_everywhere(
+    seed: int, within: str, scaled: bool, n: int, robots: int, data: st.DataObject
+) -> None:
+    gaps = data.draw(st.lists(st.floats(0.0, 0.6), min_size=4, max_size=4))
+    obstacles = obstacles_of(table_house([cupboard(k, gap) for k, gap in enumerate(gaps)]))
+    # Floors may end where nothing stands.
+    inset_m = data.draw(st.floats(0.0, 0.8))
+    low, high = (inset_m, inset_m), (ROOM_M[0] - inset_m, ROOM_M[1] - inset_m)
+    floor = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+    obstacles = replace(obstacles, floors_m=(floor,))
+    params = CandidateParams.model_validate(
+        {"per_scene": n, "within": within, "scaled_base": scaled, "robots_per_scene": robots}
+    )
+    target_m = np.array([*MIDDLE, TABLE_TOP_M + 0.05])
+    made, plain = (
+        draw(target_m, obstacles, params, np.random.default_rng(seed))
+        for draw in (draw_candidates, plain_candidates)
+    )
+    assert (made is None) == (plain is None)
+    if made is not None and plain is not None:
+        assert (made.clearance_m >= 0).all()
+        assert within == "clear" or (distances(made, target_m)[1] <= made.arm_reach_m).all()
+        for name in ("base_xy_m", "robot_index", "camera_height_m", "base_height_m", "arm_reach_m"):
+            np.testing.assert_array_equal(getattr(made, name), getattr(plain, name), name)
+        np.testing.assert_array_equal(made.clearance_m, plain.clearance_m)
