@@ -65,20 +65,21 @@ def candidates(at: SettledScene) -> SceneCandidates:
     ones = np.ones(n, np.float32)
     camera_m, height_m = ones * np.float32(1.2), ones * np.float32(HEIGHT_M)
     params = CandidateParams(base_radius_m=0.2)
-    radius_m = np.full(len(xy), params.base_radius_m)
+    radius_m = np.full(n, params.base_radius_m)
     clearance = base_clearance_m(xy, height_m, camera_m, radius_m, at.house.obstacles, params.mast_radius_m)
     return SceneCandidates(
         xy, np.zeros(n, np.int16), camera_m, height_m, ones * np.float32(REACH_M), clearance
     )
 
 
+def label(spec: Specification, at: SettledScene | None = None) -> dict[str, np.ndarray]:
+    at = at or scene()
+    return load_label_source(spec.label_source).label(at, candidates(at), spec, StageClock())
+
+
 @pytest.fixture(scope="module")
 def labelled() -> dict[str, dict[str, np.ndarray]]:
-    at = scene()
-    return {
-        name: load_label_source(name).label(at, candidates(at), spec, StageClock())
-        for name, spec in (("plan", specification()), ("sim", specification(trial=TrialParams())))
-    }
+    return {"plan": label(specification()), "sim": label(specification(trial=TrialParams()))}
 
 
 def test_each_candidate_has_the_cause_a_person_would_name(labelled: dict[str, Any]) -> None:
@@ -148,7 +149,7 @@ def test_the_first_grasp_decides_and_later_ones_are_stored(monkeypatch: pytest.M
     for trial in tried:
         assert len(trial.results) == 3
         assert (trial.outcome, trial.retry_outcome) == (trial.results[0].outcome, trial.results[-1].outcome)
-    columns = load_label_source("sim").label(at, candidates(at), spec, StageClock())
+    columns = label(spec, at)
     np.testing.assert_array_equal(columns["attempts"], [3, 3, 3, 0, 0, 0])
     np.testing.assert_array_equal(columns["trials"], [1, 1, 1, 0, 0, 0])
     assert not columns["successes"].any() and not columns["label"].any()
@@ -157,12 +158,9 @@ def test_the_first_grasp_decides_and_later_ones_are_stored(monkeypatch: pytest.M
     assert "none" not in retries[:3] and set(retries[3:]) == {"none"}
 
 
-def test_repeats_are_counted(labelled: dict[str, Any]) -> None:
-    at = scene()
+def test_repeats_are_counted() -> None:
     wild = DisturbanceParams(repeats=4, target_position_std_m=0.02, base_position_std_m=0.15)
-    columns = load_label_source("sim").label(
-        at, candidates(at), specification(trial=TrialParams(), disturbance=wild), StageClock()
-    )
+    columns = label(specification(trial=TrialParams(), disturbance=wild))
     planned = columns["path_length_rad"] > 0
     np.testing.assert_array_equal(columns["trials"], np.where(planned, 4, 0))
     assert (columns["successes"] <= columns["attempts"]).all()
@@ -174,9 +172,8 @@ def test_repeats_are_counted(labelled: dict[str, Any]) -> None:
 
 
 def test_plans_from_arrivals_do_not_change_the_label(labelled: dict[str, Any]) -> None:
-    at, wild = scene(), DisturbanceParams(repeats=4, base_position_std_m=0.15)
-    plan = load_label_source("plan").label(at, candidates(at), specification(disturbance=wild), StageClock())
-    calm = labelled["plan"]
+    wild = DisturbanceParams(repeats=4, base_position_std_m=0.15)
+    plan, calm = label(specification(disturbance=wild)), labelled["plan"]
     for name in calm.keys() - {"trials", "successes"}:
         np.testing.assert_array_equal(plan[name], calm[name], err_msg=name)
     np.testing.assert_array_equal(calm["successes"], calm["label"])
@@ -187,34 +184,24 @@ def test_plans_from_arrivals_do_not_change_the_label(labelled: dict[str, Any]) -
 
 
 def test_a_robot_plans_from_where_it_arrives(labelled: dict[str, Any]) -> None:
-    at = scene()
     near = DisturbanceParams(
         repeats=2, target_position_std_m=0.0, target_yaw_std_rad=0.0, base_position_std_m=0.03
     )
-    columns = load_label_source("sim").label(
-        at, candidates(at), specification(trial=TrialParams(), disturbance=near), StageClock()
-    )
+    columns = label(specification(trial=TrialParams(), disturbance=near))
     # Executed blindly, errors of 3 cm at the base would miss most grasps.
     np.testing.assert_array_equal(columns["successes"][:3], [2, 2, 2])
     np.testing.assert_array_equal(columns["q_grasp_rad"][:3], labelled["plan"]["q_grasp_rad"][:3])
 
 
-def test_a_target_without_grasps_has_outcome_no_grasp() -> None:
-    wide = box_model("wide", (0.3, 0.3, 0.2))
-    at = scene_of(table_house(), [wide], [on_table(wide)])
-    columns = plan_source.label(at, candidates(at), specification(), StageClock())
-    assert {NAMES[code] for code in columns["outcome"]} == {"base_collision", "no_grasp"}
-
-
-def test_a_target_inside_another_body_is_an_outcome() -> None:
-    block = box_model("block", (0.07, 0.07, 0.14))
+def test_a_target_without_grasps_or_inside_another_body_has_outcome_no_grasp() -> None:
+    wide, block = box_model("wide", (0.3, 0.3, 0.2)), box_model("block", (0.07, 0.07, 0.14))
     T = on_table(TARGET, 0.0, -0.2)
-    at = scene_of(table_house(), [TARGET, block], [T, T @ translation(0, 0, 0.01)])
-    columns = plan_source.label(at, candidates(at), specification(), StageClock())
-    assert NAMES[columns["outcome"][0]] == "no_grasp" and not columns["label"].any()
+    within = scene_of(table_house(), [TARGET, block], [T, T @ translation(0, 0, 0.01)])
+    for at in (scene_of(table_house(), [wide], [on_table(wide)]), within):
+        columns = label(specification(), at)
+        assert NAMES[columns["outcome"][0]] == "no_grasp" and not columns["label"].any()
 
 
 def test_an_arm_needs_its_section() -> None:
-    at = scene()
     with pytest.raises(InputError, match="arm"):
-        plan_source.label(at, candidates(at), specification().model_copy(update={"arm": None}), StageClock())
+        label(specification().model_copy(update={"arm": None}))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,11 +70,11 @@ def engine() -> Iterator[Any]:
     physx.set_shape_config(shape)
 
 
-def make(engine: Any, *tasks: Any, **more: Any) -> Any:
+def made(engine: Any, *tasks: Any) -> closing[Any]:
     """The registered environment with these tasks."""
     import gymnasium
 
-    return gymnasium.make(engine.ENV_ID, tasks=list(tasks), **more)
+    return closing(gymnasium.make(engine.ENV_ID, tasks=list(tasks), obs_mode="state"))
 
 
 @pytest.mark.parametrize("world", WORLDS)
@@ -82,8 +83,7 @@ def test_both_engines_agree(engine: Any, planned: Planned, world: str) -> None:
     task = engine.GraspTask(planned.prepared, planned.base, planned.plan, disturbance)
     own = run_trial(planned.prepared, planned.base, planned.plan, disturbance)
     assert own.outcome == outcome
-    env = make(engine, task, obs_mode="state")
-    try:
+    with made(engine, task) as env:
         unwrapped = env.unwrapped
         assert isinstance(unwrapped, engine.DatagenGraspEnv)
         assert engine.execute_plans(unwrapped).tolist() == [outcome == "success"]
@@ -91,21 +91,16 @@ def test_both_engines_agree(engine: Any, planned: Planned, world: str) -> None:
             lift_m = float(unwrapped.evaluate()["lift_m"][0])
             assert lift_m == pytest.approx(own.lift_m, abs=0.003)
             assert unwrapped.get_obs().shape == env.observation_space.shape
-    finally:
-        env.close()
 
 
 def test_a_policy_can_step_it(engine: Any, planned: Planned) -> None:
     task = engine.GraspTask(planned.prepared, planned.base, planned.plan, Disturbance.none(0.6))
-    env = make(engine, task, obs_mode="state")
-    try:
+    with made(engine, task) as env:
         env.reset(seed=0)
         observed, reward, terminated, truncated, info = env.step(env.action_space.sample())
         assert bool(observed.isfinite().all())
         assert float(reward) == 0.0 and not bool(terminated) and not bool(truncated)
         assert set(info) >= {"success", "held", "lift_m", "slip_m"}
-    finally:
-        env.close()
 
 
 def test_tasks_of_different_robots_are_refused(engine: Any, planned: Planned) -> None:
@@ -115,7 +110,6 @@ def test_tasks_of_different_robots_are_refused(engine: Any, planned: Planned) ->
         engine.GraspTask(p, planned.base, planned.plan, Disturbance.none(0.6))
         for p in (planned.prepared, prepared)
     ]
-    with pytest.raises(InputError, match="differ in robot"):
-        make(engine, *tasks)
-    with pytest.raises(InputError, match="are missing"):
-        make(engine)
+    for refused, problem in ((tasks, "differ in robot"), ([], "are missing")):
+        with pytest.raises(InputError, match=problem):
+            made(engine, *refused)
