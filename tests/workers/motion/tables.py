@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from functools import cache
 
@@ -13,7 +14,7 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.grasps.grasp_cache import GraspSet
 from datagen.workers.houses.house import House, StaticBody
-from datagen.workers.motion import MotionPlan
+from datagen.workers.motion import MotionPlan, PlanReport
 from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.rendering import SceneGeometry
@@ -38,28 +39,16 @@ def arm(reach_m: float = 0.85, height_m: float = 0.75) -> Robot:
 
 def box_grasps() -> GraspSet:
     """Of a box of `BOX_M`: from above with the fingers along both sides, and from four sides."""
-    poses, scores = [], []
-    for turn in (0.0, np.pi / 2):
-        c, s = np.cos(turn), np.sin(turn)
-        y = np.array([c, s, 0.0])
-        for deep in (0.02, 0.035):
-            poses.append(_grasp([0, 0, BOX_M[2] / 2 - deep], [0, 0, -1], y))
-            scores.append(1.0)
-    for turn in np.arange(4) * np.pi / 2:
-        z = np.array([np.cos(turn), np.sin(turn), 0.0])
-        for height in (0.0, 0.03):
-            poses.append(_grasp([0, 0, height], z, np.array([-z[1], z[0], 0.0])))
-            scores.append(0.8)
-    openings = np.full(len(poses), 0.064, np.float32)
-    return GraspSet(np.array(poses), openings, np.array(scores, np.float32))
-
-
-def _grasp(position_m: Sequence[float], approach: Sequence[float] | F64, closing: F64) -> F64:
-    z, y = np.asarray(approach, np.float64), np.asarray(closing, np.float64)
-    T = np.eye(4)
-    T[:3, :3] = np.column_stack([np.cross(y, z), y, z])
-    T[:3, 3] = position_m
-    return T
+    rows = [  # height of the TCP, approach, closing axis
+        *((BOX_M[2] / 2 - deep, [0, 0, -1], y) for y in np.eye(3)[:2] for deep in (0.02, 0.035)),
+        *((z, [c, s, 0], [-s, c, 0]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1)) for z in (0.0, 0.03)),
+    ]
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    for k, (height_m, approach, closing) in enumerate(rows):
+        T[k, :3, :3] = np.column_stack([np.cross(closing, approach), closing, approach])
+        T[k, 2, 3] = height_m
+    scores = np.repeat(np.float32([1.0, 0.8]), [4, 8])
+    return GraspSet(T, np.full(len(rows), 0.064, np.float32), scores)
 
 
 def scene_of(
@@ -106,6 +95,15 @@ def front_base(
     center = scene.target_center_m
     xy = np.array([center[0] + dx_m, center[1] - away_m])
     return pose_of_base(xy, (robot or arm()).base_height_m, center)
+
+
+def digest(report: PlanReport) -> str:
+    """Of everything in a report."""
+    content = hashlib.sha256(f"{report.outcome} {report.grasps_free} {report.grasps_tried}".encode())
+    if report.plan is not None:
+        for name in report.plan.__dataclass_fields__:
+            content.update(np.asarray(getattr(report.plan, name)).tobytes())
+    return content.hexdigest()
 
 
 class HalfSpaces:

@@ -8,24 +8,16 @@ import pytest
 from datagen.workers.motion.forward_kinematics import forward_kinematics
 from datagen.workers.motion.planning_scene import moving_of
 from datagen.workers.motion.reach_table import reach_table
-from datagen.workers.robots import ROBOTS, open_robot, robot_limits
 from datagen.workers.robots.robot import Robot
 from tests.workers.motion.tables import arm
+from tests.workers.robots.robots_under_test import CASES, label_of, opened
+
+HIGHEST = {case[:2]: case for case in CASES}  # one of each robot and reach
 
 
-def robots() -> list[Robot]:
-    opened = []
-    for name in ROBOTS:
-        limits = robot_limits(name)
-        height_m = (limits.base_height_m or (0.7, 0.7))[0]
-        reach_m = limits.reach_m[1]
-        opened.append(open_robot(name, reach_m, height_m))
-    return opened
-
-
-@pytest.fixture(scope="module", params=range(len(ROBOTS)), ids=list(ROBOTS))
+@pytest.fixture(params=HIGHEST.values(), ids=label_of)
 def robot(request: pytest.FixtureRequest) -> Robot:
-    return robots()[request.param]
+    return opened(request.param)
 
 
 def joints(robot: Robot, count: int) -> np.ndarray:
@@ -47,9 +39,8 @@ def test_the_hand_is_taken_off_the_arm(robot: Robot) -> None:
     """What is planned with the fingers at the grasp's opening must not also come with the fingers open."""
     moving = moving_of(robot)
     parts = sum(len(p) for p in robot.link_parts_m)
-    hand = len(robot.gripper.parts_at(robot.gripper.max_opening_m))
     assert len(moving.fixed) + len(moving.arm) + len(moving.hand.hulls) == parts
-    assert len(moving.hand.hulls) == hand
+    assert len(moving.hand.hulls) == len(robot.gripper.parts_at(robot.gripper.max_opening_m))
 
 
 def test_reachable_poses_lie_near_the_table_and_its_seeds_lead_there(robot: Robot) -> None:
@@ -81,29 +72,13 @@ def test_seeds_are_near_their_pose_and_differ(robot: Robot) -> None:
     assert np.median(gap_m) < 0.25 * table.length_m
 
 
-def test_the_table_refuses_what_is_far_out_of_reach() -> None:
-    robot = arm()
-    table = reach_table(robot, forward_kinematics(robot))
-    far = np.tile(np.eye(4), (2, 1, 1))
-    far[:, 0, 3] = (1.5, -2.0)
-    assert not np.isfinite(table.distance(far)).any()
-
-
-def test_arms_that_are_scaled_copies_share_one_table() -> None:
+def test_arms_that_are_scaled_copies_share_one_table_that_refuses_what_is_far_out_of_reach() -> None:
     """Short arms too, which carry a tube between the flange and a hand that is not scaled."""
     tables = [reach_table(r, forward_kinematics(r)) for r in (arm(0.45), arm(0.6), arm(0.95))]
     assert len({id(table.samples) for table in tables}) == 1
     assert tables[0].length_m < tables[1].length_m < tables[2].length_m
+    far = np.tile(np.eye(4), (2, 1, 1))
+    far[:, 0, 3] = (1.5, -2.0)
+    assert not np.isfinite(tables[2].distance(far)).any()
     other = reach_table(arm(0.6), forward_kinematics(arm(0.6)), draw=1)
     assert not np.array_equal(other.samples.q_rad, tables[1].samples.q_rad)
-
-
-@pytest.mark.parametrize("reach_m", [0.45, 0.7, 1.0])
-def test_seeds_of_a_shared_table_lead_to_the_poses_of_each_arm(reach_m: float) -> None:
-    robot = arm(reach_m)
-    kinematics = forward_kinematics(robot)
-    T = kinematics.tcp(joints(robot, 60))
-    table = reach_table(robot, kinematics)
-    distance, seeds = table.distance(T), table.seeds(T, 3)
-    near = np.flatnonzero(np.isfinite(distance))
-    assert np.mean([any(robot.ik(T[k], s) is not None for s in seeds[k]) for k in near]) > 0.9

@@ -21,6 +21,7 @@ from tests.workers.motion.tables import (
     arm,
     box_grasps,
     deepest_in_plan_m,
+    digest,
     front_base,
     table_scene,
 )
@@ -67,10 +68,8 @@ def test_poses_stay_near_their_grasps(seed: int, rounds: int, each: int) -> None
 
 def test_turns_about_the_closing_axis_are_wide() -> None:
     approach = ORIGINS.varied(200, np.random.default_rng(1)).T_world_tcp()[:, :3, 2]
-    turned = np.degrees(
-        np.arccos((approach * np.repeat(ORIGINS.T_world_grasp[:, :3, 2], 200, axis=0)).sum(1))
-    )
-    assert np.quantile(turned, 0.5) > 10 and turned.max() > 40
+    cosine = (approach * np.repeat(ORIGINS.T_world_grasp[:, :3, 2], 200, axis=0)).sum(1)
+    assert np.quantile(cosine, 0.5) < np.cos(np.radians(10)) and cosine.min() < np.cos(np.radians(40))
 
 
 @pytest.mark.parametrize("row", [FROM_ABOVE, FROM_THE_SIDE])
@@ -86,14 +85,13 @@ def test_a_base_from_which_one_grasp_fails_finds_a_pose_near_it(row: int) -> Non
     assert abs(T[:3, 1] @ T_grasp[:3, 1]) > np.cos(np.radians(12))
     assert np.linalg.norm(T[:3, 3] - T_grasp[:3, 3]) < 0.01
     assert (report.plan.grasp, report.plan.grasp_score) == (-1, 1.0)
+    assert digest(report) == digest(plan_from(prepared(row, 3, held), away_m))
 
 
 def test_a_grasp_with_a_plan_is_taken_as_without_the_search() -> None:
     for away_m in (0.4, 0.55, 0.7):
         with_search, without = (plan_from(prepared(FROM_ABOVE, n, held), away_m) for n in (3, None))
-        assert with_search.plan is not None and without.plan is not None
-        for name in without.plan.__dataclass_fields__:
-            np.testing.assert_array_equal(getattr(with_search.plan, name), getattr(without.plan, name))
+        assert without.plan is not None and digest(with_search) == digest(without)
 
 
 def test_the_hand_must_hold_the_object_in_the_pose() -> None:
@@ -107,12 +105,6 @@ def test_the_hand_must_hold_the_object_in_the_pose() -> None:
     grasp = box_grasps().T_object_tcp[FROM_ABOVE]
     assert seen and all(np.linalg.norm((T - grasp)[:3, 3]) < 0.01 for T, _ in seen)
     assert {opening_m for _, opening_m in seen} == {float(box_grasps().opening_m[FROM_ABOVE])}
-
-
-def test_the_same_numbers_give_the_same_plan() -> None:
-    a, b = (plan_from(prepared(FROM_ABOVE, 3, held), TOO_FAR_M[FROM_ABOVE]) for _ in range(2))
-    assert a.plan is not None and b.plan is not None and a.grasps_tried == b.grasps_tried
-    np.testing.assert_array_equal(a.plan.q_reach_rad, b.plan.q_reach_rad)
 
 
 def test_a_base_out_of_reach_stays_so() -> None:

@@ -7,14 +7,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from datagen.schemas.outcomes import OUTCOMES
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.geometry.transforms import inverse
 from datagen.workers.houses.house import StaticBody
 from datagen.workers.motion import MotionPlan, PlanReport
 from datagen.workers.motion.arm_collision import surroundings
-from datagen.workers.motion.grasp_filter import backed, raised
-from datagen.workers.motion.grasp_goals import _nearest_first
 from datagen.workers.motion.plan_candidate import STAGES, plan_candidate
 from datagen.workers.motion.planning_scene import prepare
 from datagen.workers.robots.robot import Robot
@@ -26,12 +22,13 @@ from tests.workers.motion.tables import (
     arm,
     box_grasps,
     deepest_in_plan_m,
+    digest,
     front_base,
     over_target,
     prepared,
     table_scene,
 )
-from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, box_model
+from tests.workers.worlds import ROOM_M, box_body, box_model
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 CLUTTER = [
@@ -53,19 +50,6 @@ def made(report: PlanReport) -> MotionPlan:
     assert report.outcome == "success"
     assert report.plan is not None
     return report.plan
-
-
-def same(a: PlanReport, b: PlanReport) -> bool:
-    """Bit for bit."""
-    if (a.outcome, a.grasps_free, a.grasps_tried) != (b.outcome, b.grasps_free, b.grasps_tried):
-        return False
-    if a.plan is None or b.plan is None:
-        return a.plan is b.plan
-    return all(np.array_equal(getattr(a.plan, f), getattr(b.plan, f)) for f in a.plan.__dataclass_fields__)
-
-
-def test_stages_are_outcomes() -> None:
-    assert set(STAGES) <= set(OUTCOMES)
 
 
 @pytest.mark.parametrize("clutter", [[], CLUTTER], ids=["alone", "clutter"])
@@ -127,15 +111,18 @@ def test_a_low_shelf_leaves_no_grasp_from_above() -> None:
     assert deepest_in_plan_m(scene, arm(), plan, front_base(scene)) < 0
 
 
-def test_without_room_to_lift_there_is_no_grasp() -> None:
-    board = over_target("board", (0.5, 0.3, 0.02), BOX_M[2] + PARAMS.lift_m - 0.03)
-    report = plan_at(table_scene([board]), front_base(table_scene()))
+@pytest.mark.parametrize(
+    ("size_m", "low_m"),
+    [
+        ((0.5, 0.3, 0.02), BOX_M[2] + PARAMS.lift_m - 0.03),  # no room to lift
+        ((0.6, 0.6, 0.8), -0.1),  # a solid block around the target: no surface is cut
+    ],
+)
+def test_a_target_under_a_board_or_in_a_block_has_no_grasp(
+    size_m: tuple[float, float, float], low_m: float
+) -> None:
+    report = plan_at(table_scene([over_target("board", size_m, low_m)]), front_base(table_scene()))
     assert (report.outcome, report.plan, report.grasps_free, report.grasps_tried) == ("no_grasp", None, 0, 0)
-
-
-def test_a_solid_block_around_the_target_is_seen_although_no_surface_is_cut() -> None:
-    block = over_target("block", (0.6, 0.6, 0.8), -0.1)
-    assert plan_at(table_scene([block]), front_base(table_scene())).outcome == "no_grasp"
 
 
 def wall_in_front(height_m: float) -> StaticBody:
@@ -153,15 +140,12 @@ def test_a_wall_between_base_and_target_stops_the_arm() -> None:
 
 
 def test_no_tucked_pose_that_is_free_is_no_start() -> None:
-    scene = table_scene()
-    base = front_base(scene)
-    robot = arm()
+    base, robot = front_base(table_scene()), arm()
     tcps = np.array([(base @ robot.T_base_tcp(q))[:3, 3] for q in robot.homes_rad])
     cubes = [
         box_body(f"cube|{k}", "furniture", "Box", (0.06, 0.06, 0.06), tuple(p)) for k, p in enumerate(tcps)
     ]
-    report = plan_at(table_scene(cubes), base)
-    assert report.outcome in ("no_start", "arm_collision")
+    assert plan_at(table_scene(cubes), base).outcome in ("no_start", "arm_collision")
 
 
 def test_too_far_or_too_near_has_no_joint_configuration() -> None:
@@ -170,32 +154,18 @@ def test_too_far_or_too_near_has_no_joint_configuration() -> None:
     assert plan_at(scene, front_base(scene, away_m=2.0)).outcome == "no_ik"
 
 
-def test_grasps_left_out_for_the_reach_of_the_wrist_change_no_report(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_report_depends_on_the_filter_by_the_wrist_or_on_how_many_grasps_are_looked_at_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     scene = table_scene(clutter=CLUTTER)
     ready = prepared(scene, params=PARAMS.model_copy(update={"lift_m": 0.2}))
     bases = [front_base(scene, dx_m=dx, away_m=d) for dx in (0.0, 0.3) for d in np.arange(0.4, 0.95, 0.05)]
     fast = [plan_candidate(ready, base, rng()) for base in bases]
     every = lambda robot, T, beyond_m=0.0: np.ones(len(T), np.bool_)  # noqa: E731
     monkeypatch.setattr(Robot, "is_wrist_within_reach", every)
-    assert all(
-        same(plan_candidate(ready, base, rng()), report) for base, report in zip(bases, fast, strict=True)
-    )
+    monkeypatch.setattr("datagen.workers.motion.grasp_goals._FILTERED_AT_ONCE", 7)
+    assert [digest(plan_candidate(ready, base, rng())) for base in bases] == list(map(digest, fast))
     assert {report.outcome for report in fast} >= {"success", "no_lift", "no_ik"}
-
-
-@pytest.mark.parametrize("at_once", [1, 7, 1000])
-def test_grasps_come_nearest_first_however_many_are_looked_at_together(
-    at_once: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene = table_scene()
-    ready, T_base_world = prepared(scene), inverse(front_base(scene, away_m=0.65))
-    table, T = ready.moving.table, T_base_world @ ready.around.T_world_tcp
-    ends = [T, backed(T, PARAMS.pregrasp_m), T_base_world @ raised(ready.around.T_world_tcp, PARAMS.lift_m)]
-    farthest = np.max([table.distance(end) for end in ends], axis=0)
-    monkeypatch.setattr("datagen.workers.motion.grasp_goals._FILTERED_AT_ONCE", at_once)
-    found = list(_nearest_first(ready, T_base_world, T, table.distance(T)))
-    assert 1 < len(found) == np.isfinite(farthest).sum() < len(T)
-    assert (np.diff(farthest[found]) >= -1e-9).all()
 
 
 def test_the_pedestal_is_an_obstacle_for_all_but_the_first_links() -> None:
@@ -257,14 +227,12 @@ def test_taking_clutter_away_turns_no_success_into_a_collision() -> None:
 
 def test_the_floor_under_a_low_target_is_no_collision_of_the_mount() -> None:
     scene = table_scene()
-    report = plan_at(scene, front_base(scene, arm(0.85, 0.5)), robot=arm(0.85, 0.5))
-    assert report.outcome == "success"
-    assert TABLE_TOP_M > 0.5
+    robot = arm(0.85, 0.5)
+    assert plan_at(scene, front_base(scene, robot), robot=robot).outcome == "success"
 
 
 def test_a_target_deep_within_another_thing_is_taken_by_no_grasp() -> None:
-    free = made(plan_at(scene := table_scene(), front_base(scene)))
-    assert free.grasp >= 0
+    scene = table_scene()
     for overlap_m, is_held in ((0.003, False), (0.02, True)):
         beside = BOX_M[0] / 2 + 0.06 / 2 - overlap_m
         low = (box_model("low", (0.06, 0.06, 0.05)), TARGET_XY_M[0], TARGET_XY_M[1] + beside)

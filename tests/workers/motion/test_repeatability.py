@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import hashlib
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +13,7 @@ from datagen.workers.motion import PlanReport
 from datagen.workers.motion.plan_candidate import plan_candidate
 from datagen.workers.motion.planning_scene import PlanningScene
 from datagen.workers.scenes import SettledScene
-from tests.workers.motion.tables import arm, deepest_in_plan_m, front_base, prepared, table_scene
+from tests.workers.motion.tables import arm, deepest_in_plan_m, digest, front_base, prepared, table_scene
 from tests.workers.worlds import ROOM_M, box_body
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -30,15 +29,6 @@ def barred_scene() -> SettledScene:
 def plan_at(scene: PlanningScene, place: int, rng: np.random.Generator) -> PlanReport:
     dx_m, away_m = PLACES[place]
     return plan_candidate(scene, front_base(barred_scene(), dx_m=dx_m, away_m=away_m), rng)
-
-
-def digest(report: PlanReport) -> str:
-    """Of everything in a report."""
-    content = hashlib.sha256(f"{report.outcome} {report.grasps_free} {report.grasps_tried}".encode())
-    if report.plan is not None:
-        for name in report.plan.__dataclass_fields__:
-            content.update(np.asarray(getattr(report.plan, name)).tobytes())
-    return content.hexdigest()
 
 
 def digests(order: list[int]) -> dict[int, str]:

@@ -70,9 +70,6 @@ def test_a_closed_wall_ends_at_the_cap() -> None:
     asked = wall.asked
     find(wall, 0, 100)
     assert wall.asked > asked
-
-
-def test_no_iterations_no_path() -> None:
     assert find(Slit(), 0, 0) == (None, 0)
 
 
