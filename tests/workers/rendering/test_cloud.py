@@ -56,9 +56,7 @@ def test_a_cloud_with_too_few_points_is_padded_with_zeros() -> None:
 def test_stored_order_begins_with_a_farthest_point_sample() -> None:
     cloud = observe()
     points = cloud.points_m.astype(np.float32)
-    gaps = []
-    for k in range(1, 64):
-        gaps.append(np.linalg.norm(points[k] - points[:k], axis=1).min())
+    gaps = [np.linalg.norm(points[k] - points[:k], axis=1).min() for k in range(1, 64)]
     # Each next point is the farthest from those before it, so the gaps never grow.
     assert (np.diff(gaps) <= 2e-3).all()
     others = np.linalg.norm(points[64:, None] - points[None, :64], axis=2).min(1)

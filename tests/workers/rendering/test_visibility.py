@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.workers.rendering import SceneGeometry
 from datagen.workers.rendering.embree import ray_scene
 from datagen.workers.rendering.visibility import visible_pixels
 from tests.independent import pixel_counts
@@ -21,56 +20,37 @@ from tests.workers.worlds import (
 )
 
 CENTRE = (ROOM_M[0] / 2, ROOM_M[1] / 2)
+BOX = box_model("target", (0.1, 0.1, 0.1))
+BOARD = box_model("board", (0.01, 0.6, 0.6))
 
 
-def rho(stage: SceneGeometry, eye_m: tuple[float, float, float], window: int = 64) -> float:
-    alone, seen = visible_pixels(ray_scene(stage), 0, np.array([eye_m]), window)
-    return seen[0] / alone[0]
+@pytest.mark.parametrize(
+    ("boards_m", "eye_m", "share"),
+    [
+        ([], (0.5, 1.5, 1.2), 1),
+        ([], (2.0, 1.5, 2.2), 1),
+        ([], (-1.0, 1.5, 1.2), 0),  # outside, behind the wall
+        ([], (2.0, 1.5, 0.3), 0),  # under the table
+        ([(-0.3, 0)], (0.5, 1.5, 0.85), 0),
+        ([(0.3, 0)], (0.5, 1.5, 0.85), 1),
+        # The board's edge lies on the sight line's plane: it hides what is left of it.
+        ([(-0.3, -0.3)], (0.3, CENTRE[1], TABLE_TOP_M + 0.05), 0.5),
+    ],
+)
+def test_walls_boards_and_the_table_hide_what_is_behind_them(
+    boards_m: list[tuple[float, float]], eye_m: tuple[float, float, float], share: float
+) -> None:
+    stage = stage_with([BOX, *([BOARD] * len(boards_m))], [(0, 0), *boards_m])
+    alone, seen = visible_pixels(ray_scene(stage), 0, np.array([eye_m]), 64)
+    assert seen[0] / alone[0] == pytest.approx(share, abs=0.03)
 
 
-def triangles_of(stage: SceneGeometry) -> list[np.ndarray]:
-    """World triangles (F, 3, 3) of each object and, last, of the house."""
-    placed = [m.visual.transformed(T) for m, T in zip(stage.objects, stage.T_world_object, strict=True)]
-    bodies = [b.visual for b in stage.house.bodies]
-    own = [m.vertices_m.astype(np.float64)[m.faces] for m in placed]
-    return [*own, np.concatenate([m.vertices_m.astype(np.float64)[m.faces] for m in bodies])]
-
-
-def test_a_lone_target_is_wholly_seen_from_every_side() -> None:
-    stage = stage_with([box_model("target", (0.08, 0.06, 0.12))], [(0, 0)])
-    eyes = [(0.5, 1.5, 1.2), (3.5, 1.5, 1.0), (2.0, 0.4, 1.5), (2.0, 1.5, 2.2)]
-    assert [rho(stage, eye) for eye in eyes] == [1.0] * 4
-
-
-def test_a_wall_a_board_and_the_table_itself_hide_the_target() -> None:
-    target = box_model("target", (0.08, 0.06, 0.12))
-    stage = stage_with([target], [(0, 0)])
-    assert rho(stage, (-1.0, 1.5, 1.2)) == 0  # outside, behind the wall
-    assert rho(stage, (2.0, 1.5, 0.3)) == 0  # under the table
-    tall = box_model("board", (0.02, 0.4, 0.5))
-    assert rho(stage_with([target, tall], [(0, 0), (-0.2, 0)]), (0.5, 1.5, 0.85)) == 0
-    assert rho(stage_with([target, tall], [(0, 0), (0.2, 0)]), (0.5, 1.5, 0.85)) == 1
-
-
-def test_a_half_hidden_target_is_half_visible() -> None:
-    target = box_model("target", (0.1, 0.1, 0.1))
-    board = box_model("board", (0.01, 0.6, 0.6))
-    # The board's edge lies on the sight line's plane: it hides what is left of it.
-    stage = stage_with([target, board], [(0, 0), (-0.3, -0.3)])
-    assert rho(stage, (0.3, CENTRE[1], TABLE_TOP_M + 0.05)) == pytest.approx(0.5, abs=0.03)
-
-
-def test_an_eye_inside_the_target_sees_nothing() -> None:
-    stage = stage_with([ball_model("target", 0.05)], [(0, 0)])
-    eye = stage.T_world_object[:1, :3, 3]
-    alone, seen = visible_pixels(ray_scene(stage), 0, eye, 64)
-    assert (alone[0], seen[0]) == (0, 0)
-
-
-def test_a_ball_fills_its_window_as_a_disc_does() -> None:
+def test_a_ball_fills_its_window_as_a_disc_does_and_an_eye_inside_it_sees_nothing() -> None:
     stage = stage_with([ball_model("target", 0.06)], [(0, 0)])
-    alone, _ = visible_pixels(ray_scene(stage), 0, np.array([[0.6, 1.5, 1.4], [2.0, 0.2, 0.9]]), 64)
-    np.testing.assert_allclose(alone / 64**2, np.pi / 4, rtol=0.03)
+    eyes = np.array([stage.T_world_object[0, :3, 3], [0.6, 1.5, 1.4], [2.0, 0.2, 0.9]])
+    alone, seen = visible_pixels(ray_scene(stage), 0, eyes, 64)
+    assert (alone[0], seen[0]) == (0, 0)
+    np.testing.assert_allclose(alone[1:] / 64**2, np.pi / 4, rtol=0.03)
 
 
 @given(
@@ -90,14 +70,11 @@ def test_pixel_counts_equal_those_of_a_second_implementation(
         box_model("c", (0.04, 0.3, 0.04)),
     ]
     stage = stage_with(models, offsets)
-    triangles = triangles_of(stage)
-    eye = np.array(
-        [
-            np.clip(CENTRE[0] + distance * np.cos(angle), 0.05, ROOM_M[0] - 0.05),
-            np.clip(CENTRE[1] + distance * np.sin(angle), 0.05, ROOM_M[1] - 0.05),
-            height,
-        ]
-    )
+    placed = [m.visual.transformed(T) for m, T in zip(models, stage.T_world_object, strict=True)]
+    meshes = [*placed, *(b.visual for b in stage.house.bodies)]
+    triangles = [m.vertices_m.astype(np.float64)[m.faces] for m in meshes]
+    xy = np.array(CENTRE) + distance * np.array([np.cos(angle), np.sin(angle)])
+    eye = np.array([*np.clip(xy, 0.05, np.array(ROOM_M) - 0.05), height])
     centre = stage.T_world_object[0, :3, 3]
     expected = pixel_counts(triangles[0], np.concatenate(triangles[1:]), centre, models[0].radius_m, eye, 48)
     alone, seen = visible_pixels(ray_scene(stage), 0, eye[None], 48)
