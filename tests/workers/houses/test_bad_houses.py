@@ -41,10 +41,6 @@ def drop(*path: Any) -> Callable[[dict], None]:
     return change
 
 
-def deep(levels: int) -> Any:
-    return json.loads("[" * levels + "]" * levels)
-
-
 BOW_TIE = [xyz(0, 0, 0), xyz(4, 0, 3), xyz(4, 0, 0), xyz(0, 0, 3)]
 LINE = [xyz(0, 0, 0), xyz(1, 0, 0), xyz(2, 0, 0)]
 
@@ -52,45 +48,28 @@ LINE = [xyz(0, 0, 0), xyz(1, 0, 0), xyz(2, 0, 0)]
 BROKEN: dict[str, tuple[Callable[[dict], None], str]] = {
     "no rooms": (put("rooms", value=[]), "$.rooms: has no rooms"),
     "rooms missing": (drop("rooms"), "has no key 'rooms'"),
-    "rooms null": (put("rooms", value=None), "$.rooms: is null, not a list"),
     "rooms an object": (put("rooms", value={}), "$.rooms: is an object, not a list"),
     "too many rooms": (put("rooms", value=[{}] * 300), "$.rooms: has 300 entries"),
-    "room a number": (put("rooms", 0, value=3), "$.rooms[0]: is a number, not an object"),
     "room id twice": (put("rooms", 1, "id", value="room|0"), "$.rooms[1].id"),
-    "room id empty": (put("rooms", 1, "id", value=""), "$.rooms[1].id"),
-    "room type missing": (drop("rooms", 0, "roomType"), "$.rooms[0]: has no key 'roomType'"),
-    "floor with two corners": (put("rooms", 0, "floorPolygon", value=LINE[:2]), "$.rooms[0].floorPolygon"),
     "floor on a line": (put("rooms", 0, "floorPolygon", value=LINE), "$.rooms[0].floorPolygon"),
     "floor crosses itself": (put("rooms", 0, "floorPolygon", value=BOW_TIE), "$.rooms[0].floorPolygon"),
     "floor with 100 corners": (put("rooms", 0, "floorPolygon", value=LINE * 34), "102 entries"),
     "floor corner NaN": (put("rooms", 0, "floorPolygon", 0, "x", value=NAN), "floorPolygon[0].x: nan"),
-    "floor corner far": (put("rooms", 0, "floorPolygon", 0, "x", value=5000), "floorPolygon[0].x: 5000"),
-    "floor z a text": (put("rooms", 0, "floorPolygon", 0, "z", value="1"), "floorPolygon[0].z: is a string"),
-    "walls missing": (drop("walls"), "has no key 'walls'"),
     "wall id twice": (put("walls", 1, "id", value="w|0|west"), "$.walls[1].id"),
     "wall with 3 corners": (drop("walls", 0, "polygon", 3), "$.walls[0].polygon: has 3 corners"),
     "wall without height": (put("walls", 0, "polygon", value=[xyz(0, 0, 0)] * 4), "$.walls[0].polygon"),
     "wall of 100 m": (put("walls", 0, "polygon", 2, "y", value=100), "$.walls[0].polygon: a wall 100 m"),
-    "wall corner infinite": (put("walls", 0, "polygon", 1, "x", value=INFINITY), "polygon[1].x: inf"),
     "wall colour 300": (put("walls", 0, "material", "color", "r", value=300), "color.r: 300"),
     "hole without area": (put("doors", 0, "holePolygon", value=[xyz(1, 0, 0)] * 2), "$.doors[0].holePolygon"),
     "hole past the wall": (
         put("doors", 0, "holePolygon", value=[xyz(9, 0, 0), xyz(10, 2, 0)]), "$.doors[0].holePolygon"),
     "hole with one corner": (put("doors", 0, "holePolygon", value=[xyz(0, 0, 0)]), "$.doors[0].holePolygon"),
-    "door wall a list": (put("doors", 0, "wall0", value=[]), "$.doors[0].wall0: is a list"),
-    "windows a text": (put("windows", value="none"), "$.windows: is a string"),
-    "objects missing": (drop("objects"), "has no key 'objects'"),
     "object id twice": (put("objects", 0, "children", 0, "id", value="0|table"), "children[0].id"),
     "object position missing": (drop("objects", 0, "position"), "$.objects[0]: has no key 'position'"),
-    "object y missing": (drop("objects", 0, "position", "y"), "position: has no key 'y'"),
     "object true": (put("objects", 0, "position", "x", value=True), "position.x: is a boolean"),
     "object far": (put("objects", 0, "position", "x", value=-1e30), "position.x: -1e+30"),
-    "object yaw NaN": (put("objects", 0, "rotation", "y", value=NAN), "rotation.y: nan"),
     "object huge integer": (put("objects", 0, "position", "x", value=10**400), "position.x: a huge number"),
-    "asset a number": (put("objects", 0, "assetId", value=7), "$.objects[0].assetId: is a number"),
     "id of 10,000 letters": (put("objects", 0, "id", value="x" * 10_000), "$.objects[0].id"),
-    "children an object": (put("objects", 0, "children", value={"a": 1}), "$.objects[0].children"),
-    "too many children": (put("objects", 0, "children", value=[0] * 2000), "2000 entries"),
     "too many objects": (put("objects", value=[0] * 6000), "$.objects: has 6000 entries"),
 }  # fmt: skip
 
@@ -118,7 +97,6 @@ LINES: dict[str, tuple[bytes, str]] = {
     "nested 100,000 deep": (b"[" * 100_000, "nested too deeply"),
     "not UTF-8": (b'{"rooms": "\xff\xfe"}', "not UTF-8"),
     "a number": (b"12", "a number, not an object"),
-    "null": (b"null", "null, not an object"),
     "a number of 10,000 digits": (b'{"rooms": ' + b"9" * 10_000 + b"}", "too many digits"),
 }
 
@@ -135,12 +113,10 @@ def test_a_line_that_is_no_house_is_named(tmp_path: Path, case: str):
 
 
 TABLES: dict[str, tuple[Any, str]] = {
-    "empty": ({}, "neither an object of assets"),
     "a number": (5, "neither an object of assets"),
     "no size": ({"A": {"objectType": "Bed"}}, "$.A: has no key 'size'"),
     "two sides": ({"A": {"objectType": "Bed", "size": [1, 2]}}, "2 numbers"),
     "negative side": ({"A": {"objectType": "Bed", "size": [1, -2, 1]}}, "-2 is not within"),
-    "kilometre side": ({"A": {"objectType": "Bed", "size": [1, 2000, 1]}}, "2000 is not within"),
     "NaN side": ({"A": {"objectType": "Bed", "size": [1, NAN, 1]}}, "nan is not within"),
     "NaN rest height": ({"A": {"objectType": "Bed", "size": [1, 1, 1], "surface_height_m": NAN}}, "nan"),
     "type missing": ({"A": {"size": [1, 1, 1]}}, "key 'objectType'"),
@@ -156,7 +132,7 @@ def test_a_broken_size_table_is_refused_at_opening(tmp_path: Path, case: str):
     assert named in str(caught.value)
 
 
-def test_folders_and_references_that_do_not_exist(tmp_path: Path):
+def test_folders_and_references_without_houses(tmp_path: Path):
     for ref in ("castle", "", "procthor", "procthor:/no/such/folder", f"procthor:{tmp_path}", "ai2thor:/no"):
         with pytest.raises(InputError):
             open_houses(ref)
@@ -168,9 +144,6 @@ def test_folders_and_references_that_do_not_exist(tmp_path: Path):
     write_houses(tmp_path, [two_rooms()], sizes=None)
     with pytest.raises(InputError, match="has no size table"):
         open_houses(f"procthor:{tmp_path}")
-
-
-def test_a_folder_without_houses(tmp_path: Path):
     write_houses(tmp_path, [])
     with pytest.raises(InputError, match="without houses"):
         open_houses(f"procthor:{tmp_path}")
@@ -184,9 +157,8 @@ def test_damaged_archives_are_named(tmp_path: Path, damage: str):
     path = write_houses(tmp_path, [two_rooms()]) / "houses.jsonl.gz"
     data = path.read_bytes()
     flipped = data[:60] + bytes(255 - b for b in data[60:90]) + data[90:]
-    path.write_bytes(
-        {"truncated": data[: len(data) // 2], "not gzip": b"PK" + data, "flipped": flipped}[damage]
-    )
+    damaged = {"truncated": data[: len(data) // 2], "not gzip": b"PK" + data, "flipped": flipped}
+    path.write_bytes(damaged[damage])
     with pytest.raises(InputError, match=r"houses\.jsonl\.gz"):
         open_houses(f"procthor:{tmp_path}")
 
@@ -198,10 +170,6 @@ def test_two_different_houses_with_one_id_are_refused_by_that_id(tmp_path: Path)
     assert source.house_ids() == ["two-rooms"]
     with pytest.raises(InputError, match=r"two houses: houses\.jsonl\.gz:1 and houses\.jsonl\.gz:2"):
         source.load("two-rooms")
-
-
-def test_a_house_that_is_not_there(tmp_path: Path):
-    source = open_houses(f"procthor:{write_houses(tmp_path, [two_rooms()])}")
     with pytest.raises(InputError, match="no house 'x'"):
         source.load("x")
 

@@ -83,26 +83,17 @@ def test_a_pipe_in_a_files_place_is_refused(name: str, tmp_path: Path) -> None:
         open_houses(f"procthor:{tmp_path}")
 
 
-def bad_text(where: str, text: str) -> dict[str, Any]:
+def bad_text(things: str, key: str, text: str) -> dict[str, Any]:
     house = two_rooms()
-    if where == "room id":
-        house["rooms"][0]["id"] = text
-    elif where == "room type":
-        house["rooms"][0]["roomType"] = text
-    elif where == "object id":
-        house["objects"][0]["id"] = text
-    elif where == "asset id":
-        house["objects"][0]["assetId"] = text
-    else:
-        house["walls"][0]["id"] = text
+    house[things][0][key] = text
     return house
 
 
 @pytest.mark.parametrize("text", ["\ud800", "a\0b", "\x1b[31m", "a\u202eb", "a\nb"], ids=ascii)
-@pytest.mark.parametrize("where", ["room id", "room type", "object id", "asset id", "wall id"])
+@pytest.mark.parametrize("where", ["rooms id", "rooms roomType", "objects id", "objects assetId", "walls id"])
 def test_a_text_that_cannot_be_printed_is_a_bad_house(where: str, text: str, tmp_path: Path) -> None:
     """Refused where it is read: in a store, a lone surrogate would quarantine the shard without a name."""
-    write_houses(tmp_path, [bad_text(where, text)])
+    write_houses(tmp_path, [bad_text(*where.split(), text)])
     source = open_houses(f"procthor:{tmp_path}")
     with pytest.raises(InputError, match="unprintable character") as refused:
         source.load("two-rooms")
@@ -110,13 +101,10 @@ def test_a_text_that_cannot_be_printed_is_a_bad_house(where: str, text: str, tmp
     assert "houses.jsonl.gz" in told and "two-rooms" in told and "$." in told and told.isprintable()
 
 
-def test_a_bad_key_of_the_size_table_is_named(tmp_path: Path) -> None:
+def test_a_key_of_the_size_table_or_a_file_name_that_cannot_be_printed_is_refused(tmp_path: Path) -> None:
     write_houses(tmp_path, [two_rooms()], sizes={**SIZES, "Table\ud800": SIZES["Table_1"]})
     with pytest.raises(InputError, match=r"asset_sizes\.json.*unprintable character \\ud800"):
         open_houses(f"procthor:{tmp_path}")
-
-
-def test_a_file_name_that_cannot_be_printed_is_refused(tmp_path: Path) -> None:
     write_houses(tmp_path, [two_rooms()], name="a\x1b[2J.jsonl")
     with pytest.raises(InputError, match="unprintable"):
         open_houses(f"procthor:{tmp_path}")
@@ -126,7 +114,7 @@ def test_a_file_name_that_cannot_be_printed_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_bad_house_is_read_once_by_a_world(tmp_path: Path) -> None:
-    write_houses(tmp_path, [bad_text("room id", "\ud800")])
+    write_houses(tmp_path, [bad_text("rooms", "id", "\ud800")])
     source, reads = open_houses(f"procthor:{tmp_path}"), list[str]()
 
     class Counted:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -86,14 +87,6 @@ def test_the_inner_doorway_is_open_where_wall0_says(house: House):
     assert wall_covers(house, (4.0, 2.1), 2.3)  # the lintel
 
 
-def test_a_hole_given_along_wall1_alone_is_mirrored(tmp_path: Path):
-    document = two_rooms()
-    document["walls"] = [w for w in document["walls"] if w["id"] != "w|0|east"]
-    house = load(tmp_path, document)
-    assert not wall_covers(house, (4.0, 2.1), 1.0)
-    assert wall_covers(house, (4.0, 0.9), 1.0)
-
-
 def test_walls_of_both_rooms_become_one_with_two_colours(tmp_path: Path):
     document = two_rooms()
     next(w for w in document["walls"] if w["id"] == "w|1|west")["material"] = {
@@ -123,29 +116,44 @@ def test_windows_are_holes_above_a_sill_and_doors_to_the_outside_are_closed(hous
     assert any(b.object_type == "Door" for b in house.bodies)
 
 
-def test_a_window_down_to_the_floor_stops_a_base(tmp_path: Path):
-    document = two_rooms()
-    document["windows"][0]["holePolygon"] = [xyz(1, 0, 0), xyz(2, 2, 0)]
-    house = load(tmp_path, document)
-    assert wall_covers(house, (8.0, 1.5), 0.05)
-    assert not wall_covers(house, (8.0, 1.5), 0.5)
+def without_wall0(house: dict) -> None:
+    house["walls"] = [w for w in house["walls"] if w["id"] != "w|0|east"]
 
 
-def test_open_walls_are_passages(tmp_path: Path):
-    document = two_rooms()
-    document["doors"] = document["doors"][1:]
-    for w in document["walls"]:
+def window_to_the_floor(house: dict) -> None:
+    house["windows"][0]["holePolygon"] = [xyz(1, 0, 0), xyz(2, 2, 0)]
+
+
+def open_walls(house: dict) -> None:
+    house["doors"] = house["doors"][1:]
+    for w in house["walls"]:
         w["empty"] = w["id"] in ("w|0|east", "w|1|west")
-    house = load(tmp_path, document)
-    assert not wall_covers(house, (4.0, 1.0), 1.0)
 
 
-def test_walls_that_overlap_in_part_do_not_fill_the_door(tmp_path: Path):
+def wall_along_another(house: dict) -> None:
+    house["walls"].append(wall("long", "room|1", (4.0, 0.0), (4.0, 5.0)))
+
+
+@pytest.mark.parametrize(
+    ("change", "free_m", "solid_m"),
+    [
+        (without_wall0, (4.0, 2.1, 1.0), (4.0, 0.9, 1.0)),  # the hole along wall1 is mirrored
+        (window_to_the_floor, (8.0, 1.5, 0.5), (8.0, 1.5, 0.05)),  # what stops a base
+        (open_walls, (4.0, 1.0, 1.0), (8.0, 0.5, 1.0)),
+        (wall_along_another, (4.0, 2.1, 1.0), (4.0, 4.5, 1.0)),  # the door is not filled
+    ],
+)
+def test_changed_walls_are_free_and_solid_where_they_must_be(
+    tmp_path: Path,
+    change: Callable[[dict], None],
+    free_m: tuple[float, float, float],
+    solid_m: tuple[float, float, float],
+):
     document = two_rooms()
-    document["walls"].append(wall("long", "room|1", (4.0, 0.0), (4.0, 5.0)))
+    change(document)
     house = load(tmp_path, document)
-    assert not wall_covers(house, (4.0, 2.1), 1.0)
-    assert wall_covers(house, (4.0, 4.5), 1.0)
+    assert not wall_covers(house, free_m[:2], free_m[2])
+    assert wall_covers(house, solid_m[:2], solid_m[2])
 
 
 def test_floors_lie_below_zero_and_cover_their_rooms(house: House):
@@ -189,9 +197,12 @@ def test_unknown_assets_and_hidden_objects_are_left_out(tmp_path: Path):
     document["objects"] += [
         thing("0|what", "0a1b", xyz(1, 1, 1), children=[thing("0|on", "Mug_1", xyz(1, 1.2, 1))]),
         thing("0|fridge", "Fridge_1", xyz(3, 0.9, 1), children=[thing("0|in", "Mug_1", xyz(3, 0.9, 1))]),
+        thing("out", "Table_1", xyz(20, 0.375, 2.0)),
     ]
     house = load(tmp_path, document)
-    assert {b.body_id for b in house.bodies if b.kind != "wall"} == {"0|table", "0|mug", "0|card", "0|fridge"}
+    things = {b.body_id for b in house.bodies if b.kind != "wall"}
+    assert things == {"0|table", "0|mug", "0|card", "0|fridge", "out"}
+    assert [s.body_id for s in house.surfaces] == ["0|table"]  # what is outside every room carries nothing
 
 
 def test_a_tilted_bat_keeps_its_centre(tmp_path: Path):
@@ -202,10 +213,3 @@ def test_a_tilted_bat_keeps_its_centre(tmp_path: Path):
     vertices = body(load(tmp_path, document), "0|bat").visual.vertices_m
     np.testing.assert_allclose((vertices.min(0) + vertices.max(0)) / 2, [2, 1.5, 0.5], atol=1e-5)
     assert np.ptp(vertices[:, 1]) == pytest.approx(0.96, abs=1e-5)
-
-
-def test_things_outside_every_room_carry_nothing(tmp_path: Path):
-    document = two_rooms()
-    document["objects"] = [thing("out", "Table_1", xyz(20, 0.375, 2.0))]
-    house = load(tmp_path, document)
-    assert not house.surfaces
