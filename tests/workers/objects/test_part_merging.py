@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.objects import open_objects, part_merging
 from datagen.workers.objects.convex import opening_depth
-from datagen.workers.objects.hulls import distances_m, few_vertices, hull_of, surface_points_m
+from datagen.workers.objects.hulls import distances_m, few_vertices, hull_of
 from datagen.workers.objects.part_merging import MAX_VERTICES, merge_parts
 from datagen.workers.objects.scan import read_scan
 from tests.workers.objects.merging_errors import added_volume_share, cut_off_m, error_m
@@ -110,38 +110,20 @@ def test_64_vertices_span_nearly_what_all_span() -> None:
     assert hull_of(few_vertices(hull_of(sheet @ turn).vertices_m, 12)).volume_m3 > 0
 
 
-def test_samples_lie_on_faces_and_leave_no_gap() -> None:
-    hull = hull_of(scattered(3, 1)[0])
-    step_m = 0.004
-    samples = surface_points_m(hull, step_m)
-    beyond = (samples @ hull.planes[:, :3].T + hull.planes[:, 3]).max(axis=1)
-    assert np.abs(beyond).max() < 1e-9
-    rng = np.random.default_rng(0)
-    weights = rng.dirichlet([1, 1, 1], 200)
-    for corners in hull.faces_m:
-        gaps = np.linalg.norm((weights @ corners)[:, None] - samples[None], axis=2).min(axis=1)
-        assert gaps.max() < 0.8 * step_m
-
-
 def test_merged_parts_are_read_from_the_cache(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     parts = scattered(11, 6)
     monkeypatch.setattr(part_merging, "_known", {})
     first = merge_parts(parts, 2)
     assert merge_parts(parts[::-1], 2) is first
-    (file,) = (own_cache / "hulls").iterdir()
+    assert len(list((own_cache / "hulls").iterdir())) == 1
 
     def refuse(*_: object) -> tuple[F32, ...]:
         raise AssertionError("merged again")
 
     monkeypatch.setattr(part_merging, "_known", {})
-    with monkeypatch.context() as patch:
-        patch.setattr(part_merging, "_merge", refuse)
-        again = merge_parts(parts, 2)
+    monkeypatch.setattr(part_merging, "_merge", refuse)
+    again = merge_parts(parts, 2)
     assert [part.tobytes() for part in again] == [part.tobytes() for part in first]
-
-    monkeypatch.setattr(part_merging, "_known", {})
-    file.write_bytes(file.read_bytes()[:100])
-    assert [part.tobytes() for part in merge_parts(parts, 2)] == [part.tobytes() for part in first]
 
 
 def free_depth(visual_m: F32, parts: tuple[F32, ...]) -> F64:

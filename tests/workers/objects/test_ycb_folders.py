@@ -100,9 +100,7 @@ def test_flat_parts_are_dropped(tmp_path: Path) -> None:
 
 def test_incredible_densities_are_left_out_with_the_reason(tmp_path: Path) -> None:
     folder = write_bundle(tmp_path / "set", "001_good", "002_bad")
-    index = json.loads((folder / "objects.json").read_text())
-    index[1]["mass_kg"] = 40.0
-    (folder / "objects.json").write_text(json.dumps(index))
+    _index(folder, lambda index: index[1].update(mass_kg=40.0))
     source = open_objects(f"ycb:{folder}")
     assert source.names() == ["001_good"]
     assert "kg/m3" in source.excluded["002_bad"]
@@ -151,16 +149,12 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "no index": (lambda f: (f / "objects.json").unlink(), "none of objects.json"),
     "index is a folder": (lambda f: ((f / "objects.json").unlink(), (f / "objects.json").mkdir()), "none of"),
     "index is not JSON": (_write("objects.json", "{"), "not JSON"),
-    "index is binary": (_write("objects.json", b"\xff\xfe\x00"), "not UTF-8"),
-    "index nested without end": (_write("objects.json", "[" * 100_000), "nested too deeply"),
     "index is an object": (_write("objects.json", "{}"), "objects.json"),
     "index is empty": (_write("objects.json", "[]"), "at least 1"),
     "no mass": (lambda f: _index(f, lambda index: index[0].pop("mass_kg")), "[0].mass_kg"),
     "mass 0": (_set("mass_kg", 0), "[0].mass_kg"),
-    "mass negative": (_set("mass_kg", -1), "[0].mass_kg"),
     "mass NaN": (_set("mass_kg", float("nan")), "[0].mass_kg"),
     "mass of a piano": (_set("mass_kg", 300), "[0].mass_kg"),
-    "mass in words": (_set("mass_kg", "heavy"), "[0].mass_kg"),
     "key with a path": (_set("key", "../x"), "[0].key"),
     "key twice": (lambda f: _index(f, lambda index: index.append(index[0])), "[1].key"),
     "path escapes": (_file("visual", "../../etc/passwd"), "[0].files.visual"),
@@ -168,19 +162,13 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "path empty": (_file("collision", ""), "[0].files.collision"),
     "path with NUL": (_file("collision", "a\0b"), "[0].files.collision"),
     "path through a link": (
-        lambda f: (shutil.rmtree(f / "001_cube"), (f / "001_cube").symlink_to("/usr")),
-        "[0].files.visual",
+        lambda f: ((f / "001_cube").rename(f / "x"), (f / "001_cube").symlink_to("/usr")), "[0].files.visual"
     ),
     "mesh missing": (lambda f: (f / MESH).unlink(), "textured.obj"),
-    "texture missing": (lambda f: (f / IMAGE).unlink(), "texture.png"),
-    "collision missing": (lambda f: (f / PARTS).unlink(), "collision.obj"),
     "mesh without faces": (_write(MESH, "v 0 0 0\n"), "no faces"),
     "mesh without texture coordinates": (_write(MESH, COLLISION_OBJ), "texture coordinates"),
     "mesh in millimetres": (_write(MESH, _scaled(1000)), "metres"),
-    "mesh far too small": (_write(MESH, _scaled(1e-3)), "metres"),
-    "mesh with huge coordinates": (_write(MESH, _scaled(1e30)), "metres"),
     "mesh with NaN": (_write(MESH, CUBE_OBJ.replace("0.05 0.02 0.00", "nan 0 0")), "line 4"),
-    "mesh cut off": (_write(MESH, CUBE_OBJ[:150]), "textured.obj"),
     "mesh with a missing corner": (_write(MESH, CUBE_OBJ + "f 1/1 2/2 9/3\n"), "refers to"),
     "texture not an image": (_write(IMAGE, b"hello"), "not a readable"),
     "texture cut off": (lambda f: (f / IMAGE).write_bytes((f / IMAGE).read_bytes()[:50]), "not a readable"),
@@ -188,54 +176,33 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "parts flat": (_write(PARTS, "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), "flat"),
     "parts elsewhere": (_write(PARTS, COLLISION_OBJ.replace("v 0.0", "v 0.9")), "bounding box"),
     "all left out": (_set("mass_kg", 49), "has no usable object"),
-}
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_bad_folders_are_refused_in_one_line(case: str, tmp_path: Path) -> None:
-    folder = write_bundle(tmp_path / "set")
-    change, named = BAD[case]
-    change(folder)
-    with pytest.raises(InputError) as caught:
-        open_objects(f"ycb:{folder}")
-    message = str(caught.value)
-    assert named in message and str(folder) in message and "\n" not in message
-
-
-MANISKILL_BAD: dict[str, tuple[Callable[[Path], object], str]] = {
-    "density 0": (lambda f: _density(f, 0), "001_cube.density"),
-    "density of a star": (lambda f: _density(f, 1e18), "001_cube.density"),
-    "no parts": (lambda f: (f / "models/001_cube/collision.ply").unlink(), "collision.ply"),
-    "parts broken": (
-        _write("models/001_cube/collision.ply", b"ply\nformat ascii 1.0\nelement"),
-        "collision.ply",
-    ),
-    "parts claim too much": (
-        _write(
-            "models/001_cube/collision.ply",
-            b"ply\nformat binary_little_endian 1.0\n"
-            b"element vertex 99999999999\nproperty float x\nend_header\n",
-        ),
-        "collision.ply",
-    ),
-    "no library": (lambda f: (f / "models/001_cube/textured.mtl").unlink(), "textured.mtl"),
-    "no image": (_write("models/001_cube/textured.mtl", "newmtl material_0\n"), "0 texture images"),
-    "image outside": (
-        _write("models/001_cube/textured.mtl", "newmtl material_0\nmap_Kd ../../../x.png\n"),
-        "map_Kd",
-    ),
+PLY, MTL = "models/001_cube/collision.ply", "models/001_cube/textured.mtl"
+HUGE_PLY = "ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n"
+STAR = json.dumps({"001_cube": {"density": 1e18}})
+BAD_MANISKILL: dict[str, tuple[Callable[[Path], object], str]] = {
+    "density of a star": (_write("info_pick_v0.json", STAR), "001_cube.density"),
+    "no parts": (lambda f: (f / PLY).unlink(), "collision.ply"),
+    "parts broken": (_write(PLY, "ply\nformat ascii 1.0\nelement"), "collision.ply"),
+    "parts claim too much": (_write(PLY, HUGE_PLY), "collision.ply"),
+    "no library": (lambda f: (f / MTL).unlink(), "textured.mtl"),
+    "no image": (_write(MTL, "newmtl material_0\n"), "0 texture images"),
+    "image outside": (_write(MTL, "newmtl material_0\nmap_Kd ../../../x.png\n"), "map_Kd"),
     "model missing": (lambda f: shutil.rmtree(f / "models/001_cube"), "textured.obj"),
 }
+CASES = [(write_bundle, BAD, case) for case in BAD] + [
+    (write_maniskill, BAD_MANISKILL, case) for case in BAD_MANISKILL
+]
 
 
-def _density(folder: Path, value: float) -> None:
-    (folder / "info_pick_v0.json").write_text(json.dumps({"001_cube": {"density": value}}))
-
-
-@pytest.mark.parametrize("case", MANISKILL_BAD)
-def test_bad_maniskill_folders_are_refused_in_one_line(case: str, tmp_path: Path) -> None:
-    folder = write_maniskill(tmp_path / "set")
-    change, named = MANISKILL_BAD[case]
+@pytest.mark.parametrize(("write", "table", "case"), CASES, ids=[case for _, _, case in CASES])
+def test_bad_folders_are_refused_in_one_line(
+    write: Callable[[Path], Path], table: dict[str, Any], case: str, tmp_path: Path
+) -> None:
+    folder = write(tmp_path / "set")
+    change, named = table[case]
     change(folder)
     with pytest.raises(InputError) as caught:
         open_objects(f"ycb:{folder}")
