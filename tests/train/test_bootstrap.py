@@ -8,18 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.train import metrics
-from datagen.train.bootstrap import (
-    Estimate,
-    resample_weights,
-    resampled_area_under_roc,
-    summed,
-    verdict,
-)
-
-
-def by_hand(weights: np.ndarray, scene: np.ndarray) -> list[np.ndarray]:
-    """The rows of each resample: those of a scene as often as it was drawn."""
-    return [np.repeat(np.arange(len(scene)), w[scene]) for w in weights]
+from datagen.train.bootstrap import Estimate, resample_weights, resampled_area_under_roc, summed, verdict
 
 
 @given(st.integers(0, 2**32), st.integers(1, 70), st.integers(1, 6))
@@ -34,7 +23,8 @@ def test_weighted_sums_equal_sums_of_resampled_rows(seed: int, n_scenes: int, le
     assert (weights.sum(axis=1) == n_scenes).all()
     areas = resampled_area_under_roc(weights, true, score, scene)
     counts = summed(weights, metrics.confusion(said, true, scene, n_scenes))
-    for k, rows in enumerate(by_hand(weights, scene)):
+    for k, drawn in enumerate(weights):
+        rows = np.repeat(np.arange(n), drawn[scene])  # those of a scene as often as it was drawn
         expected = metrics.area_under_roc(true[rows], score[rows])
         assert areas[k] == pytest.approx(expected, nan_ok=True)
         one = metrics.confusion(said[rows], true[rows], np.zeros(len(rows), np.int64), 1)

@@ -87,13 +87,12 @@ def test_one_class_is_refused_with_the_run_and_the_class(tmp_path: Path, label: 
     refuse_one_class(SampleStream([tmp_path / "bad", tmp_path / "good"]))
 
 
-def specification(source: str, version: str) -> Specification:
-    assets = Source(kind="builtin", digest="1" * 64)
-    return Specification(label_source=source, houses=assets, objects=assets, engines={"labels": version})
-
-
 def test_versions_of_one_source_are_not_mixed() -> None:
-    old, new = specification("sim", "1"), specification("sim", "2")
-    refuse_mixed_labels([("a", new), ("b", new), ("c", specification("plan", "1"))])
+    assets = Source(kind="builtin", digest="1" * 64)
+    old, new, other = (
+        Specification(label_source=source, houses=assets, objects=assets, engines={"labels": version})
+        for source, version in (("sim", "1"), ("sim", "2"), ("plan", "1"))
+    )
+    refuse_mixed_labels([("a", new), ("b", new), ("c", other)])
     with pytest.raises(InputError, match="sim labels are of version 2, those of a of version 1"):
         refuse_mixed_labels([("a", old), ("b", new)])
