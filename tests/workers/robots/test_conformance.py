@@ -10,12 +10,11 @@ from scipy.spatial import ConvexHull
 pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
 
 from datagen.schemas.fields import SCHEMAS
+from datagen.workers.geometry.transforms import inverse
 from datagen.workers.robots import robot_limits
 from datagen.workers.robots.hulls import MAX_CORNERS
 from datagen.workers.robots.robot import Robot
 from tests.workers.robots.robots_under_test import CASES, IDS, opened
-
-POSITION_TOLERANCE_M, ANGLE_TOLERANCE_RAD = 0.0005, np.radians(0.5)
 
 
 @pytest.fixture(params=CASES, ids=IDS)
@@ -27,11 +26,6 @@ def random_q(robot: Robot, count: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     low, high = np.maximum(robot.q_lower_rad, -np.pi), np.minimum(robot.q_upper_rad, np.pi)
     return rng.uniform(low, high, (count, len(low)))
-
-
-def pose_error(A: np.ndarray, B: np.ndarray) -> tuple[float, float]:
-    cos = (np.trace(A[:3, :3].T @ B[:3, :3]) - 1) / 2
-    return float(np.linalg.norm(A[:3, 3] - B[:3, 3])), float(np.arccos(np.clip(cos, -1, 1)))
 
 
 def test_lengths_and_limits(robot: Robot) -> None:
@@ -59,24 +53,18 @@ def test_parts_are_convex_and_small(robot: Robot) -> None:
 
 def test_homes_are_tucked_and_free(robot: Robot) -> None:
     homes = robot.homes_rad
-    assert len(homes) >= 6 and homes.shape[1] == len(robot.joint_names)
+    assert len(homes) >= 6
     assert ((homes > robot.q_lower_rad) & (homes < robot.q_upper_rad)).all()
     assert not any(robot.collides_itself(q) for q in homes)
     turns = homes[:, 0]
     assert turns.min() < -1.2 and turns.max() > 1.2  # to both sides
     for q in homes:
         T = robot.T_base_link(q)
-        moved = [
-            np.concatenate(parts) @ T[k, :3, :3].T + T[k, :3, 3]
-            for k, parts in enumerate(robot.link_parts_m)
-            if k > 0
-        ]
-        points = np.concatenate(moved)
+        links = [(T[k], np.concatenate(parts)) for k, parts in enumerate(robot.link_parts_m) if k > 0]
+        points = np.concatenate([corners @ L[:3, :3].T + L[:3, 3] for L, corners in links])
         assert np.hypot(points[:, 0], points[:, 1]).max() < max(0.45 * robot.reach_m, 0.2)
-        if robot.base_radius_m is None:
-            assert points[:, 2].min() > 0.0  # above the pedestal
-        else:
-            assert points[:, 2].min() > 0.3 - robot.base_height_m  # above the floor
+        # Above the pedestal, or 30 cm above the floor.
+        assert points[:, 2].min() > (0.0 if robot.base_radius_m is None else 0.3 - robot.base_height_m)
         if abs(q[0]) < 0.1:
             assert points[:, 0].max() < 0.3  # what stands in front is a table
 
@@ -144,8 +132,9 @@ def test_ik_reaches_what_it_returns(robot: Robot, seed: int) -> None:
     found = robot.ik(goal, other)
     if found is not None:
         assert ((found >= robot.q_lower_rad) & (found <= robot.q_upper_rad)).all()
-        distance, angle = pose_error(robot.T_base_tcp(found), goal)
-        assert distance <= POSITION_TOLERANCE_M + 1e-9 and angle <= ANGLE_TOLERANCE_RAD + 1e-6
+        off = inverse(goal) @ robot.T_base_tcp(found)
+        angle = np.arccos(np.clip((np.trace(off[:3, :3]) - 1) / 2, -1, 1))
+        assert np.linalg.norm(off[:3, 3]) <= 0.0005 + 1e-9 and angle <= np.radians(0.5) + 1e-6
     np.testing.assert_array_equal(robot.ik(goal, q), q)
 
 
@@ -188,11 +177,8 @@ def test_self_collision_agrees_with_separating_planes(robot: Robot) -> None:
 
 def separation(one: np.ndarray, two: np.ndarray) -> float:
     """Positive where a plane separates two point sets: the largest margin over normals in a unit cube."""
-    spheres = np.linalg.norm(one.mean(0) - two.mean(0))
-    if (
-        spheres
-        > np.linalg.norm(one - one.mean(0), axis=1).max() + np.linalg.norm(two - two.mean(0), axis=1).max()
-    ):
+    radii = sum(np.linalg.norm(points - points.mean(0), axis=1).max() for points in (one, two))
+    if np.linalg.norm(one.mean(0) - two.mean(0)) > radii:
         return 1.0
     # max m with n . x + m <= d <= n . y - m, |n_i| <= 1
     rows = [[*x, -1.0, 1.0] for x in one] + [[*(-y), 1.0, 1.0] for y in two]

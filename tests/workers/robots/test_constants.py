@@ -70,7 +70,10 @@ def test_fetch() -> None:
         assert corners[:, 2].min() > -0.006 < 0.0
 
 
-@pytest.mark.parametrize("description", [PANDA, XARM7, FETCH], ids=lambda d: d.name)
+each_robot = pytest.mark.parametrize("description", [PANDA, XARM7, FETCH], ids=lambda d: d.name)
+
+
+@each_robot
 def test_joints_are_those_of_the_urdf(description: RobotDescription) -> None:
     tree, robot = tree_of(description), open_robot(description.name, None, 0.8)
     for k, name in enumerate(description.arm_joints):
@@ -81,7 +84,7 @@ def test_joints_are_those_of_the_urdf(description: RobotDescription) -> None:
         assert robot.speed_limit_radps[k] == joint.speed
 
 
-@pytest.mark.parametrize("description", [PANDA, XARM7, FETCH], ids=lambda d: d.name)
+@each_robot
 def test_hulls_contain_their_meshes_closely(description: RobotDescription) -> None:
     # docs/reference/robots.md states these.
     allowed: Mapping[str, float] = {"base_link": 0.009, "torso_lift_link": 0.005, "head_pan_link": 0.005}

@@ -48,17 +48,18 @@ def test_a_missing_library_is_named_with_the_extra_that_brings_it(module: str) -
     assert "InputError: --robot" in done.stderr and "pip install" in done.stderr
 
 
-def test_limits_are_those_that_open() -> None:
+def test_limits_are_those_that_open_also_rounded_to_float32() -> None:
     for name in ("panda", "xarm7", "fetch"):
         limits = robot_limits(name)
-        low, high = limits.base_height_m or (0.0, 1.5)
-        assert open_robot(name, limits.reach_m[0], low).base_height_m == low
-        assert open_robot(name, None, high).base_height_m == high
+        for height_m in limits.base_height_m or (0.0, 1.5):
+            assert open_robot(name, limits.reach_m[0], height_m).base_height_m == height_m
+            stored = open_robot(name, None, float(np.float32(height_m)))
+            assert stored.base_height_m == pytest.approx(height_m, abs=1e-6)
     for reach_m in robot_limits("panda-scaled").reach_m:
         assert open_robot("panda-scaled", reach_m, 0.8).reach_m == reach_m
 
 
-def test_pedestals_share_an_arm_and_torsos_do_not() -> None:
+def test_pedestals_share_an_arm_and_torsos_do_not_and_the_pandas_share_a_hand_with_the_xarm() -> None:
     low, high = open_robot("panda-scaled", 0.7, 0.5), open_robot("panda-scaled", 0.7, 0.9)
     assert (low.base_height_m, high.base_height_m) == (0.5, 0.9)
     assert open_robot("panda-scaled", 0.7, 0.9) is high
@@ -66,18 +67,6 @@ def test_pedestals_share_an_arm_and_torsos_do_not() -> None:
     low, high = open_robot("fetch", None, 0.8), open_robot("fetch", None, 1.0)
     assert low.T_base_root[2, 3] == pytest.approx(-0.8) and high.T_base_root[2, 3] == pytest.approx(-1.0)
     assert low.gripper.digest == high.gripper.digest
-
-
-def test_the_family_shares_one_hand_with_the_xarm() -> None:
-    digests = {
-        open_robot(name, reach_m, 0.8).gripper.digest
-        for name, reach_m in (("panda", None), ("panda-scaled", 0.3), ("panda-scaled", 1.0), ("xarm7", None))
-    }
-    assert len(digests) == 1
-    assert open_robot("fetch", None, 0.8).gripper.digest not in digests
-
-
-def test_heights_rounded_to_float32_are_those_of_the_range() -> None:
-    for height_m in robot_limits("fetch").base_height_m or ():
-        stored = float(np.float32(height_m))
-        assert open_robot("fetch", None, stored).base_height_m == pytest.approx(height_m, abs=1e-6)
+    family = (("panda", None), ("panda-scaled", 0.3), ("panda-scaled", 1.0), ("xarm7", None))
+    shared = {open_robot(name, reach_m, 0.8).gripper.digest for name, reach_m in family}
+    assert len(shared) == 1 and low.gripper.digest not in shared
