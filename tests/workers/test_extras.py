@@ -58,12 +58,8 @@ def test_the_command_names_the_origin_or_the_libraries(
 
 
 @pytest.mark.usefixtures("site")
-def test_robots_files_alone_are_a_command_of_their_own() -> None:
-    assert how_to_get("sim") == "Install it: pip install --no-deps mani-skill"
-
-
-@pytest.mark.usefixtures("site")
 def test_a_missing_library_is_known_by_both_of_its_names() -> None:
+    assert how_to_get("sim") == "Install it: pip install --no-deps mani-skill"
     assert missing_library(ModuleNotFoundError("", name="numpy")) is None
     assert missing_library(ImportError("libX11.so.6")) is None
     for error in (ModuleNotFoundError("", name="torch.nn"), PackageNotFoundError("torch")):
