@@ -9,24 +9,21 @@ from hypothesis import strategies as st
 
 from datagen.schemas.specification import CandidateParams
 from datagen.workers.bases.clearance import base_clearance_m, obstacles_of
+from datagen.workers.houses.house import House
 from tests.workers.worlds import ROOM_M, TABLE_SIZE_M, box_body, table_house
 
 PARAMS = CandidateParams()
-OBSTACLES = obstacles_of(table_house())
+HOUSE = table_house()
 TABLE_WEST = ROOM_M[0] / 2 - TABLE_SIZE_M[0] / 2
 MIDDLE_Y = ROOM_M[1] / 2
 
 
 def clearance(
-    x: float, y: float, base_height_m: float = 0.8, camera_height_m: float = 1.2, house=None
-) -> float:  # type: ignore[no-untyped-def]
-    obstacles = OBSTACLES if house is None else obstacles_of(house)
-    place, heights = (
-        np.array([[x, y]], np.float32),
-        np.array([[base_height_m], [camera_height_m]], np.float32),
-    )
+    x: float, y: float, base_height_m: float = 0.8, camera_height_m: float = 1.2, house: House = HOUSE
+) -> float:
+    place, heights = np.float32([[x, y]]), np.float32([[base_height_m], [camera_height_m]])
     radius_m = np.array([PARAMS.base_radius_m])
-    return float(base_clearance_m(place, *heights, radius_m, obstacles, PARAMS.mast_radius_m)[0])
+    return float(base_clearance_m(place, *heights, radius_m, obstacles_of(house), PARAMS.mast_radius_m)[0])
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.1, 0.3])
@@ -60,7 +57,7 @@ def test_bodies_above_the_robot_are_no_obstacles() -> None:
 def test_a_clear_base_touches_no_box(x: float, y: float, base_height: float) -> None:
     value = clearance(x, y, base_height)
     nearest = 10.0
-    for body in table_house().bodies:
+    for body in HOUSE.bodies:
         for part in body.convex_parts_m:
             low, high = part.min(0), part.max(0)
             if high[2] > 0.02 and low[2] < base_height:

@@ -51,23 +51,20 @@ def box_grasps() -> GraspSet:
     return GraspSet(T, np.full(len(rows), 0.064, np.float32), scores)
 
 
-def scene_of(
-    house: House, objects: Sequence[ObjectModel], poses: Sequence[F64], index: int = 0
-) -> SettledScene:
+def scene_of(house: House, objects: Sequence[ObjectModel], poses: Sequence[F64]) -> SettledScene:
     T = np.stack(poses)
     rays = ray_scene(SceneGeometry(house, tuple(objects), T))
-    return ReconstructedScene(index, 0, PreparedHouse(house), tuple(objects), T, rays, camera=None)  # type: ignore[arg-type]
+    return ReconstructedScene(0, 0, PreparedHouse(house), tuple(objects), T, rays, camera=None)  # type: ignore[arg-type]
 
 
 def table_scene(
     furniture: Sequence[StaticBody] = (),
     clutter: Sequence[tuple[ObjectModel, float, float]] = (),
-    target_xy_m: tuple[float, float] = TARGET_XY_M,
 ) -> SettledScene:
     """The box on the table, with clutter at places (dx, dy) off the table's middle."""
     box = box_model("box", BOX_M)
     objects = [box, *(model for model, _, _ in clutter)]
-    poses = [on_table(box, *target_xy_m), *(on_table(m, dx, dy) for m, dx, dy in clutter)]
+    poses = [on_table(box, *TARGET_XY_M), *(on_table(m, dx, dy) for m, dx, dy in clutter)]
     return scene_of(table_house(furniture), objects, poses)
 
 
@@ -84,8 +81,9 @@ def prepared(
     robot: Robot | None = None,
     grasps: GraspSet | None = None,
     params: MotionParams = PARAMS,
+    per_scene: int = 40,
 ) -> PlanningScene:
-    return prepare(scene, robot or arm(), box_grasps() if grasps is None else grasps, params, 40, PEDESTAL_M)
+    return prepare(scene, robot or arm(), grasps or box_grasps(), params, per_scene, PEDESTAL_M)
 
 
 def front_base(

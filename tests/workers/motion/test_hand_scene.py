@@ -12,25 +12,19 @@ from datagen.workers.grasps.search import HandClearance
 from datagen.workers.motion import PlanReport
 from datagen.workers.motion.grasp_filter import hand_of
 from datagen.workers.motion.plan_candidate import plan_candidate
-from datagen.workers.motion.planning_scene import PlanningScene, hand_scene, prepare
+from datagen.workers.motion.planning_scene import PlanningScene, hand_scene
 from datagen.workers.scenes import SettledScene
 from tests.workers.motion.tables import (
     BOX_M,
     PARAMS,
-    PEDESTAL_M,
     arm,
     box_grasps,
     front_base,
     over_target,
+    prepared,
     table_scene,
 )
 from tests.workers.worlds import box_vertices
-
-
-def some_grasps(rows: np.ndarray) -> GraspSet:
-    every = box_grasps()
-    return GraspSet(every.T_object_tcp[rows], every.opening_m[rows], every.score[rows])
-
 
 FROM_ABOVE = np.flatnonzero(box_grasps().T_object_tcp[:, 2, 2] < -0.5)
 FROM_SIDES = np.flatnonzero(box_grasps().T_object_tcp[:, 2, 2] > -0.5)
@@ -40,22 +34,16 @@ def below_a_shelf() -> SettledScene:
     return table_scene([over_target("shelf", (0.5, 0.3, 0.02), BOX_M[2] + 0.15)])
 
 
-def prepared_for(
-    scene: SettledScene, grasps: GraspSet, reach_m: float = 0.85, per_scene: int = 40
-) -> PlanningScene:
-    return prepare(scene, arm(reach_m), grasps, PARAMS, per_scene, PEDESTAL_M)
-
-
 def test_robots_with_one_hand_share_the_scene() -> None:
     scene, grasps = table_scene(), box_grasps()
-    long, short = (prepared_for(scene, grasps, reach_m) for reach_m in (0.85, 0.6))
+    long, short = (prepared(scene, arm(reach_m), grasps) for reach_m in (0.85, 0.6))
     assert long.around is short.around
-    assert prepared_for(scene, grasps, per_scene=2).around is not long.around
-    assert prepared_for(table_scene(), grasps).around is not long.around
+    assert prepared(scene, arm(), grasps, per_scene=2).around is not long.around
+    assert prepared(table_scene(), arm(), grasps).around is not long.around
 
 
 def test_every_grasp_comes_in_both_turns() -> None:
-    around = prepared_for(table_scene(), box_grasps(), per_scene=3).around
+    around = prepared(table_scene(), per_scene=3).around
     assert around.grasp[around.kept].tolist() == [0, 0, 1, 1, 2, 2] and around.grasps_free == 3
     assert set(around.grasp[around.rest].tolist()) == set(range(3, len(box_grasps())))
     np.testing.assert_allclose(around.T_world_tcp[1::2, :3, :2], -around.T_world_tcp[::2, :3, :2], atol=1e-12)
@@ -65,10 +53,12 @@ def test_every_grasp_comes_in_both_turns() -> None:
 def test_all_grasps_are_checked_where_the_first_are_blocked() -> None:
     """Those from above come first here, and a shelf takes them."""
     assert (np.diff(box_grasps().T_object_tcp[:, 2, 2]) >= 0).all()
-    some = prepared_for(below_a_shelf(), box_grasps(), per_scene=len(FROM_ABOVE))
+    some = prepared(below_a_shelf(), per_scene=len(FROM_ABOVE))
     assert some.grasps_free == len(FROM_SIDES) and len(some.around.rest) == 0
     assert plan_at(some, below_a_shelf()).outcome == "success"
-    none = prepared_for(below_a_shelf(), some_grasps(FROM_ABOVE))
+    every, rows = box_grasps(), FROM_ABOVE
+    from_above = GraspSet(every.T_object_tcp[rows], every.opening_m[rows], every.score[rows])
+    none = prepared(below_a_shelf(), grasps=from_above)
     assert none.grasps_free == 0 and plan_at(none, below_a_shelf()).outcome == "no_grasp"
 
 
@@ -76,7 +66,7 @@ def test_a_candidate_tries_other_grasps_where_the_first_fail() -> None:
     """With how many a scene is looked at first decides nothing but the cost."""
     scene = table_scene()
     bases = [front_base(scene, dx_m=dx, away_m=d) for dx in (-0.3, 0.0, 0.3) for d in (0.45, 0.65, 0.75)]
-    few, all_of_them = (prepared_for(scene, box_grasps(), per_scene=n) for n in (1, 40))
+    few, all_of_them = (prepared(scene, per_scene=n) for n in (1, 40))
     assert len(few.around.rest) > 0
     for base in bases:
         labels = [plan_candidate(p, base, np.random.default_rng(0)).plan is None for p in (few, all_of_them)]
@@ -86,7 +76,7 @@ def test_a_candidate_tries_other_grasps_where_the_first_fail() -> None:
 def test_a_grasp_that_does_not_hold_gives_no_plan() -> None:
     """Scores of later grasps are asked for when there is a plan."""
     scene, every, asked = table_scene(), box_grasps(), list[int]()
-    first = plan_at(prepared_for(scene, every), scene).plan
+    first = plan_at(prepared(scene), scene).plan
     assert first is not None
 
     def later_score(row: int) -> float:
@@ -94,11 +84,11 @@ def test_a_grasp_that_does_not_hold_gives_no_plan() -> None:
         return float(row != first.grasp)
 
     unscored = GraspSet(every.T_object_tcp, every.opening_m, every.score[:0], 0.5, later_score)
-    plan = plan_at(prepared_for(scene, unscored), scene).plan
+    plan = plan_at(prepared(scene, grasps=unscored), scene).plan
     assert plan is not None and plan.grasp != first.grasp
     assert asked[0] == first.grasp and asked[-1] == plan.grasp
     nothing = GraspSet(every.T_object_tcp, every.opening_m, every.score[:0], 0.5, lambda _: 0.0)
-    assert plan_at(prepared_for(scene, nothing), scene).plan is None
+    assert plan_at(prepared(scene, grasps=nothing), scene).plan is None
 
 
 def plan_at(ready: PlanningScene, scene: SettledScene) -> PlanReport:

@@ -14,15 +14,15 @@ from datagen.workers.grasps.grasp_cache import GraspSet
 from datagen.workers.motion import PlanReport
 from datagen.workers.motion.nearby_poses import NearbyPoses
 from datagen.workers.motion.plan_candidate import plan_candidate
-from datagen.workers.motion.planning_scene import PlanningScene, prepare
+from datagen.workers.motion.planning_scene import PlanningScene
 from tests.workers.motion.tables import (
     PARAMS,
-    PEDESTAL_M,
     arm,
     box_grasps,
     deepest_in_plan_m,
     digest,
     front_base,
+    prepared,
     table_scene,
 )
 
@@ -32,13 +32,13 @@ TOO_FAR_M = {FROM_ABOVE: 0.75, FROM_THE_SIDE: 0.65}
 ORIGINS = NearbyPoses.of_grasps(box_grasps().T_object_tcp, np.full(len(box_grasps()), 0.06))
 
 
-def prepared(row: int, rounds: int | None, score: Callable[[F64, float], float]) -> PlanningScene:
+def searched(row: int, rounds: int | None, score: Callable[[F64, float], float]) -> PlanningScene:
     every = box_grasps()
     one = GraspSet(
         every.T_object_tcp[[row]], every.opening_m[[row]], every.score[[row]], 0.5, pose_score=score
     )
     params = PARAMS.model_copy(update={"nearby_rounds": rounds})
-    return prepare(table_scene(), arm(), one, params, 40, PEDESTAL_M)
+    return prepared(table_scene(), grasps=one, params=params)
 
 
 def plan_from(ready: PlanningScene, away_m: float) -> PlanReport:
@@ -75,8 +75,8 @@ def test_turns_about_the_closing_axis_are_wide() -> None:
 @pytest.mark.parametrize("row", [FROM_ABOVE, FROM_THE_SIDE])
 def test_a_base_from_which_one_grasp_fails_finds_a_pose_near_it(row: int) -> None:
     away_m = TOO_FAR_M[row]
-    assert plan_from(prepared(row, None, held), away_m).plan is None
-    report = plan_from(prepared(row, 3, held), away_m)
+    assert plan_from(searched(row, None, held), away_m).plan is None
+    report = plan_from(searched(row, 3, held), away_m)
     assert report.outcome == "success" and report.plan is not None and report.grasps_tried > 1
     base, scene, robot = front_base(table_scene(), away_m=away_m), table_scene(), arm()
     assert deepest_in_plan_m(scene, robot, report.plan, base) < 0
@@ -85,12 +85,12 @@ def test_a_base_from_which_one_grasp_fails_finds_a_pose_near_it(row: int) -> Non
     assert abs(T[:3, 1] @ T_grasp[:3, 1]) > np.cos(np.radians(12))
     assert np.linalg.norm(T[:3, 3] - T_grasp[:3, 3]) < 0.01
     assert (report.plan.grasp, report.plan.grasp_score) == (-1, 1.0)
-    assert digest(report) == digest(plan_from(prepared(row, 3, held), away_m))
+    assert digest(report) == digest(plan_from(searched(row, 3, held), away_m))
 
 
 def test_a_grasp_with_a_plan_is_taken_as_without_the_search() -> None:
     for away_m in (0.4, 0.55, 0.7):
-        with_search, without = (plan_from(prepared(FROM_ABOVE, n, held), away_m) for n in (3, None))
+        with_search, without = (plan_from(searched(FROM_ABOVE, n, held), away_m) for n in (3, None))
         assert without.plan is not None and digest(with_search) == digest(without)
 
 
@@ -101,12 +101,12 @@ def test_the_hand_must_hold_the_object_in_the_pose() -> None:
         seen.append((T_object_tcp, opening_m))
         return 0.0
 
-    assert plan_from(prepared(FROM_ABOVE, 3, dropped), TOO_FAR_M[FROM_ABOVE]).outcome == "no_path"
+    assert plan_from(searched(FROM_ABOVE, 3, dropped), TOO_FAR_M[FROM_ABOVE]).outcome == "no_path"
     grasp = box_grasps().T_object_tcp[FROM_ABOVE]
     assert seen and all(np.linalg.norm((T - grasp)[:3, 3]) < 0.01 for T, _ in seen)
     assert {opening_m for _, opening_m in seen} == {float(box_grasps().opening_m[FROM_ABOVE])}
 
 
 def test_a_base_out_of_reach_stays_so() -> None:
-    report = plan_from(prepared(FROM_THE_SIDE, 3, held), 1.2)
+    report = plan_from(searched(FROM_THE_SIDE, 3, held), 1.2)
     assert (report.outcome, report.plan) == ("no_ik", None)

@@ -1,6 +1,7 @@
-"""What `open_robot` refuses, and what it keeps."""
+"""What `open_robot` refuses, what it keeps, and that it is the same robot in every process."""
 
 import math
+import os
 import subprocess
 import sys
 
@@ -70,3 +71,34 @@ def test_pedestals_share_an_arm_and_torsos_do_not_and_the_pandas_share_a_hand_wi
     family = (("panda", None), ("panda-scaled", 0.3), ("panda-scaled", 1.0), ("xarm7", None))
     shared = {open_robot(name, reach_m, 0.8).gripper.digest for name, reach_m in family}
     assert len(shared) == 1 and low.gripper.digest not in shared
+
+
+PRINT_DIGEST = """
+import hashlib, sys
+import numpy as np
+from datagen.workers.robots import open_robot
+order = [("panda-scaled", 0.4), ("panda", None), ("panda-scaled", 0.7), ("xarm7", None)]
+digests = {}
+for name, reach in order if sys.argv[1] == "1" else order[::-1]:
+    robot, bits = open_robot(name, reach, 0.8), hashlib.sha256()
+    low, high = robot.q_lower_rad, robot.q_upper_rad
+    for q in np.random.default_rng(0).uniform(low, high, (20, len(low))):
+        tcp = robot.T_base_tcp(q)
+        found = robot.ik(tcp, (low + high) / 2)
+        bits.update(robot.T_base_link(q).tobytes() + tcp.tobytes())
+        bits.update(b"none" if found is None else found.tobytes())
+        bits.update(bytes([robot.collides_itself(q)]))
+    bits.update(repr((robot.self_pairs, robot.gripper.digest)).encode())
+    for part in (part for parts in robot.link_parts_m for part in parts):
+        bits.update(part.tobytes())
+    digests[f"{name} {reach}"] = bits.hexdigest()
+print(sorted(digests.items()))
+"""
+
+
+def test_processes_agree_to_the_bit() -> None:
+    printed = []
+    for order in ("1", "2"):
+        command, env = [sys.executable, "-c", PRINT_DIGEST, order], os.environ | {"OMP_NUM_THREADS": order}
+        printed.append(subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout)
+    assert printed[0] == printed[1] and "panda-scaled 0.4" in printed[0]

@@ -36,28 +36,23 @@ def base_before(robot: Robot, distance_m: float) -> F64:
     return yaw_pose(ROOM_M[0] / 2 - distance_m, ROOM_M[1] / 2, robot.base_height_m, 0.0)
 
 
-def plan_from_above(
-    robot: Robot, T_world_base: F64, grasp_m: F64, opening_m: float, T_turn: F64 | None = None
-) -> MotionPlan:
+def plan_from_above(robot: Robot, T_world_base: F64, grasp_m: F64, opening_m: float) -> MotionPlan:
     """A plan that grasps at a world position (3,) from above."""
     T_grasp = inverse(T_world_base) @ translation(*grasp_m) @ DOWN
-    if T_turn is not None:
-        T_grasp = T_grasp @ T_turn
     for k, home in enumerate(robot.homes_rad):
         q_grasp = robot.ik(T_grasp, home)
         if q_grasp is None:
             continue
-        down = _line(
-            robot, q_grasp, [translation(0, 0, PREGRASP_M * s) @ T_grasp for s in np.linspace(0, 1, 9)]
+        down, up = (
+            _line(robot, q_grasp, [translation(0, 0, z) @ T_grasp for z in np.linspace(0, length_m, 10)])
+            for length_m in (PREGRASP_M, LIFT_M)
         )
-        up = _line(robot, q_grasp, [translation(0, 0, LIFT_M * s) @ T_grasp for s in np.linspace(0, 1, 11)])
         if down is None or up is None:
             continue
         approach = down[::-1]
         reach = np.stack([home, approach[0]])
-        length_rad = sum(
-            float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) for path in (reach, approach)
-        )
+        way = np.concatenate([reach, approach[1:]])
+        length_rad = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
         return MotionPlan(0, k, reach, approach, up, opening_m, length_rad, 0.05, 1.0)
     raise AssertionError("no such grasp: choose a base that reaches it")
 
