@@ -7,9 +7,10 @@ import json
 import os
 import signal
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors import safe_open
+from torch import Tensor
 
 from datagen.schemas.errors import InputError
 from datagen.train.dataset import DataOrigin
@@ -78,25 +80,19 @@ def test_written_checkpoints_are_read_back(tmp_path: Path):
     assert equal(back.weights, checkpoint.weights)
     assert equal(back.resume, checkpoint.resume)
     assert [p.name for p in path.parent.iterdir()] == ["a.ckpt"]
+    with safe_open(path, "pt") as stored:  # safetensors alone reads it, too
+        assert json.loads(stored.metadata()["head"])["format"] == "datagen checkpoint"
+        assert stored.get_tensor("weights/token.0.weight").dtype == torch.float32
+    state = torch.get_rng_state()
     model, head = load_model(path)
+    assert torch.equal(torch.get_rng_state(), state)
     assert not model.training
     assert equal(model.state_dict(), checkpoint.weights)
     assert head.digest == back.head.digest
     assert len(head.digest) == 64
-
-
-def test_safetensors_alone_reads_it(written: Path):
-    with safe_open(written, "pt") as stored:
-        assert json.loads(stored.metadata()["head"])["format"] == "datagen checkpoint"
-        assert stored.get_tensor("weights/token.0.weight").dtype == torch.float32
-
-
-def test_loading_leaves_the_global_generator_unchanged(written: Path):
-    torch.manual_seed(7)
-    load_model(written)
-    after = torch.rand(3)
-    torch.manual_seed(7)
-    assert torch.equal(torch.rand(3), after)
+    # A view is saved without its base tensor.
+    write_checkpoint(path, Checkpoint(head_of(), {"w": torch.zeros(1_000_000)[:3]}))
+    assert path.stat().st_size < 100_000
 
 
 def test_a_truncated_file_gives_one_line(written: Path, tmp_path: Path):
@@ -174,52 +170,41 @@ def test_files_are_refused_by_their_sizes(written: Path, tmp_path: Path):
 
 def test_files_that_are_no_checkpoints_are_named(tmp_path: Path):
     model = build_model("shared", TINY).state_dict()
-    plain, listed, newer = tmp_path / "plain.pt", tmp_path / "list.pt", tmp_path / "newer.ckpt"
-    foreign, zeros = tmp_path / "foreign.safetensors", tmp_path / "zeros"
-    torch.save(model, plain)
-    torch.save([1, 2], listed)
-    signed(newer, {}, {"format": "datagen checkpoint", "format_version": 3})
-    safetensors.torch.save_file(model, foreign)
-    zeros.write_bytes(bytes(100))
-    fifo = tmp_path / "fifo"
-    os.mkfifo(fifo)
+    torch.save(model, tmp_path / "plain.pt")
+    torch.save([1, 2], tmp_path / "list.pt")
+    safetensors.torch.save_file(model, tmp_path / "foreign")
+    (tmp_path / "zeros").write_bytes(bytes(100))
+    signed(tmp_path / "newer", {}, {"format": "datagen checkpoint", "format_version": 3})
+    os.mkfifo(tmp_path / "fifo")
     cases = [
-        (plain, "not a datagen checkpoint"),
-        (listed, "not a datagen checkpoint"),
-        (foreign, "not a datagen checkpoint"),
-        (zeros, "not a datagen checkpoint"),
-        (newer, "format_version: is 3, but this program reads 2. Use the version"),
-        (tmp_path, "not a file"),
-        (fifo, "not a file"),
-        (tmp_path / "none", "No such file"),
+        *((name, "not a datagen checkpoint") for name in ("plain.pt", "list.pt", "foreign", "zeros")),
+        ("newer", "format_version: is 3, but this program reads 2. Use the version"),
+        (".", "not a file"),
+        ("fifo", "not a file"),
+        ("none", "No such file"),
     ]
-    for path, words in cases:
+    for name, words in cases:
         with pytest.raises(InputError, match=words) as error:
-            load_model(path)
-        assert error.value.place == str(path)
+            load_model(tmp_path / name)
+        assert error.value.place == str(tmp_path / name)
 
 
 def test_weights_that_do_not_fit_are_named(tmp_path: Path):
     whole = checkpoint_of()
     name = next(iter(whole.weights))
-    cases: list[tuple[Checkpoint, str]] = [
-        (
-            Checkpoint(whole.head, {k: v for k, v in whole.weights.items() if k != name}),
-            "the checkpoint lacks it",
-        ),
-        (
-            Checkpoint(whole.head, {**whole.weights, "more": torch.zeros(1)}),
-            "more: the model has no such weights",
-        ),
-        (Checkpoint(whole.head, {**whole.weights, name: torch.zeros(1)}), f"{name}: .* in the model"),
-        (Checkpoint(head_of(model="none"), whole.weights), "is unknown"),
-        (Checkpoint(head_of(model_config={"width": 10**9}), whole.weights), "width"),
-        (Checkpoint(head_of(epoch="x"), whole.weights), "epoch"),
-        (Checkpoint(head_of(data=({"schema": "sim"},)), whole.weights), "spec_hashes"),
-        (Checkpoint(head_of(history=({"epoch": 1},)), whole.weights), "val_loss"),
+    lacking = {k: v for k, v in whole.weights.items() if k != name}
+    cases: list[tuple[dict[str, Any], Mapping[str, Tensor], str]] = [
+        ({}, lacking, "the checkpoint lacks it"),
+        ({}, {**whole.weights, "more": torch.zeros(1)}, "more: the model has no such weights"),
+        ({}, {**whole.weights, name: torch.zeros(1)}, f"{name}: .* in the model"),
+        ({"model": "none"}, whole.weights, "is unknown"),
+        ({"model_config": {"width": 10**9}}, whole.weights, "width"),
+        ({"epoch": "x"}, whole.weights, "epoch"),
+        ({"data": ({"schema": "sim"},)}, whole.weights, "spec_hashes"),
+        ({"history": ({"epoch": 1},)}, whole.weights, "val_loss"),
     ]
-    for checkpoint, words in cases:
-        write_checkpoint(tmp_path / "c.ckpt", checkpoint)
+    for changes, weights, words in cases:
+        write_checkpoint(tmp_path / "c.ckpt", Checkpoint(head_of(**changes), weights))
         with pytest.raises(InputError, match=words):
             load_model(tmp_path / "c.ckpt")
 
@@ -265,7 +250,9 @@ def test_every_text_and_number_of_the_document_is_checked(written: Path, tmp_pat
 
 
 @pytest.mark.parametrize("at", ["fsync", "replace"])
-def test_a_kill_during_writing_keeps_the_old_file(tmp_path: Path, at: str):
+def test_a_kill_or_a_full_disk_during_writing_keeps_the_old_file(
+    tmp_path: Path, at: str, monkeypatch: pytest.MonkeyPatch
+):
     path = tmp_path / "c.ckpt"
     write_checkpoint(path, checkpoint_of(step=1))
     before = path.read_bytes()
@@ -276,41 +263,23 @@ def test_a_kill_during_writing_keeps_the_old_file(tmp_path: Path, at: str):
         os._exit(0)
     assert os.WTERMSIG(os.waitpid(child, 0)[1]) == signal.SIGKILL
     assert path.read_bytes() == before
+    with monkeypatch.context() as full:
+        full.setattr(os, at, Mock(side_effect=OSError(28, "No space left on device")))
+        with pytest.raises(OSError, match="No space"):
+            write_checkpoint(path, checkpoint_of(step=2))
+    assert path.read_bytes() == before
     write_checkpoint(path, checkpoint_of(step=3))
     assert read_checkpoint(path).head.step == 3
     assert [p.name for p in tmp_path.iterdir()] == ["c.ckpt"]
 
 
-def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    path = tmp_path / "c.ckpt"
-    write_checkpoint(path, checkpoint_of(step=1))
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space"):
-        write_checkpoint(path, checkpoint_of(step=2))
-    assert read_checkpoint(path).head.step == 1
-    assert [p.name for p in tmp_path.iterdir()] == ["c.ckpt"]
-
-
 def test_one_process_at_a_time_writes_it(tmp_path: Path):
     path = tmp_path / "c.ckpt"
+    busy = pytest.raises(InputError, match=r"c\.ckpt: is being trained by another process")
     with only_writer(path), only_writer(tmp_path / "other.ckpt"):
-        with (
-            pytest.raises(InputError, match=r"c\.ckpt: is being trained by another process"),
-            only_writer(path),
-        ):
-            pass
-        with pytest.raises(InputError), only_writer(path):
-            pass
+        for _ in range(2):
+            with busy, only_writer(path):
+                pass
     with only_writer(path):
         pass
     assert not list(tmp_path.iterdir())
-
-
-def test_a_view_is_saved_without_its_base_tensor(tmp_path: Path):
-    large = torch.zeros(1_000_000)
-    write_checkpoint(tmp_path / "c.ckpt", Checkpoint(head_of(), {"w": large[:3]}))
-    assert (tmp_path / "c.ckpt").stat().st_size < 100_000

@@ -11,7 +11,6 @@ from rich.console import Console
 
 from datagen.display.progress import Progress
 from datagen.train.training.training_progress import TrainingProgress, TrainingStep
-from tests.cluster.simulated import FakeClock
 
 RECORD: dict[str, Any] = {
     "epoch": 3, "step": 30, "loss": 0.5, "accuracy": 0.7, "val_loss": 0.25, "val_accuracy": 0.875,
@@ -23,9 +22,9 @@ def step(k: int, step_s: float = 2.0) -> TrainingStep:
     return TrainingStep(k, 100, 1, 0.5, 1e-3, samples=60, wait_s=0.1 * step_s, step_s=step_s)
 
 
-def test_the_speed_is_that_of_the_last_minute():
+def test_lines_are_json_also_on_a_terminal_with_the_speed_of_the_last_minute():
     out = io.StringIO()
-    shown = Progress(as_json=True, console=Console(file=out))
+    shown = Progress(as_json=True, console=Console(file=out, force_terminal=True))
     lines = TrainingProgress(shown, "a.ckpt")
     for k in range(1, 6):
         lines.step(step(k, 100.0))
@@ -34,9 +33,10 @@ def test_the_speed_is_that_of_the_last_minute():
     lines.epoch(RECORD)
     shown.close()
     epoch, last = [json.loads(line) for line in out.getvalue().splitlines()]
+    assert (epoch["event"], epoch["val_auc"], epoch["best"]) == ("epoch", None, True)
     assert epoch["samples_per_s"] == pytest.approx(30)
     assert epoch["loader_share"] == pytest.approx(0.1)
-    assert (last["step"], last["left_s"]) == (40, 120)
+    assert (last["event"], last["step"], last["steps"], last["left_s"]) == ("progress", 40, 100, 120)
 
 
 def test_progress_shows_numbers_and_a_row_per_epoch():
@@ -49,16 +49,3 @@ def test_progress_shows_numbers_and_a_row_per_epoch():
     assert "epoch   3  loss 0.5000  validation 0.2500  accuracy 0.8750  best" in told
     assert "31/100" in told and "30 samples/s  0:02:18 left  data 10%" in told
     assert "None" not in told
-
-
-def test_lines_are_json_also_on_a_terminal():
-    out, clock = io.StringIO(), FakeClock()
-    lines = TrainingProgress(Progress(True, clock, Console(file=out, force_terminal=True)), "a.ckpt")
-    clock.now_s = 11.0
-    lines.step(step(31))
-    lines.step(step(32))
-    lines.epoch(RECORD)
-    first, second = [json.loads(line) for line in out.getvalue().splitlines()]
-    assert (first["event"], first["step"], first["steps"], first["left_s"]) == ("progress", 31, 100, 138)
-    assert (first["samples_per_s"], first["loader_share"]) == (30.0, 0.1)
-    assert (second["event"], second["val_auc"], second["best"]) == ("epoch", None, True)

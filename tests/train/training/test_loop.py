@@ -19,47 +19,28 @@ from datagen.train.training.training_setup import prepare_training, save_checkpo
 from tests.train.training.small import TINY_PAPER, Recorder, equal, job_of, train_until
 
 
-@pytest.fixture(scope="module")
-def whole(heuristic_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A training that nobody interrupted."""
-    out = tmp_path_factory.mktemp("whole") / "whole.ckpt"
-    assert train_until(job_of(heuristic_run, out))[0]
-    return out
-
-
-def test_stopped_at_any_batch_training_ends_the_same(heuristic_run: Path, whole: Path, tmp_path: Path):
-    truth = read_checkpoint(whole)
-    assert truth.head.step == 6
-    for step in range(1, 7):
-        job = job_of(heuristic_run, tmp_path / f"{step}.ckpt")
-        assert train_until(job, step)[0] is False
-        assert read_checkpoint(job.out).head.step == step
-        assert train_until(job)[0] is True
-        gone_on = read_checkpoint(job.out)
-        assert equal(gone_on.resume, truth.resume)
-        assert equal(gone_on.weights, truth.weights)
-        assert gone_on.head.history == truth.head.history
-        assert gone_on.loop == truth.loop
-
-
-def test_stopped_at_every_step_training_ends_the_same(heuristic_run: Path, tmp_path: Path):
-    """With batch statistics and dropout, which both leave traces that a step must find again."""
-    config = {"model": "paper", "model_config": TINY_PAPER}
-    whole = job_of(heuristic_run, tmp_path / "whole.ckpt", epochs=1, **config)
+@pytest.mark.parametrize(
+    "config",
+    [{}, {"model": "paper", "model_config": TINY_PAPER}],  # the latter with statistics of batches as well
+    ids=["shared", "paper"],
+)
+def test_stopped_at_every_step_training_ends_the_same_and_is_left_as_it_is(
+    config: dict[str, Any], heuristic_run: Path, tmp_path: Path
+):
+    whole, halting = (job_of(heuristic_run, tmp_path / name, **config) for name in ("whole", "halting"))
     assert train_until(whole)[0]
-    halting = job_of(heuristic_run, tmp_path / "halting.ckpt", epochs=1, **config)
-    while not train_until(halting, 1)[0]:
-        pass
-    assert equal(read_checkpoint(halting.out).resume, read_checkpoint(whole.out).resume)
-
-
-def test_a_finished_training_is_left_as_it_is(heuristic_run: Path, whole: Path):
-    before = whole.read_bytes()
-    done, seen = train_until(job_of(heuristic_run, whole))
-    assert done
-    assert not seen.steps
-    assert whole.read_bytes() == before
-    assert read_checkpoint(whole).head.finished
+    for step in range(1, 7):
+        assert train_until(halting, step)[0] is False
+        assert read_checkpoint(halting.out).head.step == step
+    assert train_until(halting)[0]
+    truth, gone_on = read_checkpoint(whole.out), read_checkpoint(halting.out)
+    assert truth.head.step == 6
+    assert equal(gone_on.resume, truth.resume) and equal(gone_on.weights, truth.weights)
+    assert gone_on.head.history == truth.head.history and gone_on.loop == truth.loop
+    before = Path(whole.out).read_bytes()
+    done, seen = train_until(whole)
+    assert done and truth.head.finished and not seen.steps
+    assert Path(whole.out).read_bytes() == before
 
 
 def test_the_best_epoch_is_kept_and_patience_ends_it(heuristic_run: Path, tmp_path: Path):
@@ -77,14 +58,6 @@ def test_the_best_epoch_is_kept_and_patience_ends_it(heuristic_run: Path, tmp_pa
     model, head = load_model(job.out)
     assert equal(model.state_dict(), checkpoint.weights)
     assert head == checkpoint.head
-
-
-def test_classes_have_equal_weight_in_stage_1_alone(heuristic_run: Path, tmp_path: Path):
-    training, _ = prepare_training(job_of(heuristic_run, tmp_path / "c.ckpt"))
-    counts = np.array(training.train.class_counts())  # type: ignore[attr-defined]
-    weights = training.class_weights.numpy()
-    assert weights[0] * counts[0] == pytest.approx(weights[1] * counts[1])
-    assert (weights * counts).sum() == pytest.approx(counts.sum())
 
 
 class Spoilt:
@@ -149,8 +122,14 @@ def test_weights_that_overflow_do_not_replace_a_good_checkpoint(heuristic_run: P
     assert Path(job.out).read_bytes() == before
 
 
-def test_steps_report_loss_time_and_samples(heuristic_run: Path, whole: Path, tmp_path: Path):
+def test_steps_report_loss_time_and_samples_and_classes_have_equal_weight(
+    heuristic_run: Path, tmp_path: Path
+):
     job = job_of(heuristic_run, tmp_path / "c.ckpt")
+    training, _ = prepare_training(job)
+    counts, weights = np.array(training.train.class_counts()), training.class_weights.numpy()  # type: ignore[attr-defined]
+    assert weights[0] * counts[0] == pytest.approx(weights[1] * counts[1])
+    assert (weights * counts).sum() == pytest.approx(counts.sum())
     _, seen = train_until(job)
     head = read_checkpoint(job.out).head
     assert [s.step for s in seen.steps] == [1, 2, 3, 4, 5, 6]
@@ -161,4 +140,4 @@ def test_steps_report_loss_time_and_samples(heuristic_run: Path, whole: Path, tm
     assert head.cost["train_wall_s"] >= sum(s.step_s for s in seen.steps) * 0.999
     assert head.cost["label_cpu_s"] > 0
     rows: list[dict[str, Any]] = [{k: v for k, v in row.items() if k != "best"} for row in seen.epochs]
-    assert tuple(rows) == head.history == read_checkpoint(whole).head.history
+    assert tuple(rows) == head.history
