@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import NoiseParams, ObservationParams, Source, Specification
-from datagen.train.models import build_model
 from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
-from datagen.train.scorers import ModelScorer
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.houses import open_houses
@@ -54,7 +51,7 @@ class Seen:
 
     def turned_to(self, eye_m: F64) -> Seen:
         """The same scene from another place, looking at the target."""
-        camera = camera_with(self.camera, look_at(eye_m, self.scene.target_center_m))
+        camera = replace(self.camera, T_world_camera=look_at(eye_m, self.scene.target_center_m))
         return Seen(self.scene, render_rays(self.scene.rays, camera))
 
 
@@ -65,18 +62,6 @@ def draw_seen(index: int, seed: int = 0, houses: str = "builtin", objects: str =
     spec = Specification(seed=seed, houses=house, objects=thing, observation=OBSERVATION)
     scene, _ = generate_scene(assemble_world(spec, *opened, houses, objects), index, StageClock())
     return Seen(scene, render_rays(scene.rays, scene.camera))
-
-
-def camera_with(camera: Camera, T_world_camera: F64) -> Camera:
-    return Camera(
-        T_world_camera,
-        camera.width_px,
-        camera.height_px,
-        camera.fx_px,
-        camera.fy_px,
-        camera.cx_px,
-        camera.cy_px,
-    )
 
 
 def sensor_frame(
@@ -105,10 +90,3 @@ def write_frame(folder: Path, seen: Seen, *, posed: bool = True, mask: bool = Tr
     if posed:
         (folder / "pose.json").write_text(json.dumps({"T_world_camera": c.T_world_camera.tolist()}))
     return folder
-
-
-def untrained_scorer() -> ModelScorer:
-    """A small model with the same parameters each time: it looks at cloud, robot and place."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(5)
-        return ModelScorer(build_model("shared", MODEL).eval(), "untrained")

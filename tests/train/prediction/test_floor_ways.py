@@ -21,28 +21,34 @@ def strip(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]
 
 def way(obstacles: F32, floor: F32, goal: F64 = GOAL, slack_m: float = 0.0) -> str:
     """How the base gets to one goal."""
-    none = np.empty((0, 3), np.float32)
-    floor_map = draw_map(goal, EYE, obstacles, none, floor)
+    floor_map = draw_map(goal, EYE, obstacles, NOTHING, floor)
     points = np.concatenate([obstacles, floor])
     return WAYS[ways_to(floor_map, goal, slack_m, RADIUS_M, 0.05, points, EYE)[0]]
 
 
+NOTHING = np.empty((0, 3), np.float32)
 OPEN = strip((0.5, 4.0), (-1.5, 1.5), (0.0, 0.0))
+TABLE = [strip((1.5, 1.53), (-1.0, 1.0), (0.6, 0.7)), strip((1.5, 2.2), (-1.0, 1.0), (0.7, 0.7))]
 
 
-def fence(gap_m: float, height_m: float = 0.6) -> F32:
-    """Obstacles across the way at x = 1.5, with a gap of a width in the middle; the camera sees over them."""
-    sides = [(-8.0, -gap_m / 2), (gap_m / 2, 8.0)]
-    return np.concatenate([strip((1.5, 1.56), side, (0.05, height_m), 0.03) for side in sides])
-
-
-def test_over_floor_in_sight() -> None:
-    assert way(np.empty((0, 3), np.float32), OPEN) == "seen"
+@pytest.mark.parametrize(
+    ("obstacles", "floor", "expected"),
+    [
+        (NOTHING, OPEN, "seen"),
+        (NOTHING, OPEN[(OPEN[:, 0] < 1.2) | (OPEN[:, 0] > 2.2)], "unseen"),  # of which a part was not seen
+        (np.concatenate(TABLE), OPEN[OPEN[:, 0] < 1.5], "unseen"),  # which is no wall
+    ],
+    ids=["open floor", "floor with a gap", "a low table"],
+)
+def test_a_way_over_floor_is_seen_where_the_floor_was(obstacles: F32, floor: F32, expected: str) -> None:
+    assert way(obstacles, floor) == expected
 
 
 @pytest.mark.parametrize(("gap_m", "expected"), [(0.8, "seen"), (0.3, "none"), (0.0, "none")])
 def test_a_base_fits_through_wide_gaps_alone(gap_m: float, expected: str) -> None:
-    assert way(fence(gap_m), OPEN) == expected
+    sides = [(-8.0, -gap_m / 2), (gap_m / 2, 8.0)]  # of a fence that the camera sees over
+    fence = [strip((1.5, 1.56), side, (0.05, 0.6), 0.03) for side in sides]
+    assert way(np.concatenate(fence), OPEN) == expected
 
 
 def test_a_way_around_what_ends_in_sight_is_over_unseen_floor() -> None:
@@ -51,25 +57,12 @@ def test_a_way_around_what_ends_in_sight_is_over_unseen_floor() -> None:
     assert way(np.concatenate([short, backdrop]), OPEN) == "unseen"
 
 
-def test_floor_that_was_not_seen_makes_a_way_unseen() -> None:
-    far = OPEN[OPEN[:, 0] > 2.2]
-    between = OPEN[(OPEN[:, 0] < 1.2)]
-    assert way(np.empty((0, 3), np.float32), np.concatenate([far, between])) == "unseen"
-
-
 def test_behind_a_wall_there_is_no_way_even_where_it_ends_in_sight() -> None:
     wall = strip((1.5, 1.56), (-1.0, 1.0), (0.05, 2.0), 0.03)
     front = OPEN[OPEN[:, 0] < 1.5]
     assert way(wall, front) == "none"
     beside = np.array([[3.0, 4.5]])
     assert way(wall, front, beside) == "unseen"
-
-
-def test_a_low_table_is_no_wall() -> None:
-    table = np.concatenate(
-        [strip((1.5, 1.53), (-1.0, 1.0), (0.6, 0.7)), strip((1.5, 2.2), (-1.0, 1.0), (0.7, 0.7))]
-    )
-    assert way(table, OPEN[OPEN[:, 0] < 1.5]) == "unseen"
 
 
 def test_a_narrow_base_may_go_the_last_bit_straight() -> None:

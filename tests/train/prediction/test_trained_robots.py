@@ -17,12 +17,10 @@ from datagen.train.prediction import load_scorer
 from datagen.train.prediction.base_cells import RobotSize
 from datagen.train.prediction.trained_robots import robot_notes, trained_robots
 from datagen.train.scorers import ModelScorer
-from datagen.train.training.checkpoints import CheckpointHead, read_checkpoint
-from tests.train.conftest import heuristic_run
+from datagen.train.training.checkpoints import read_checkpoint
 from tests.train.prediction.checkpoints import document_of, stored_with, write_untrained
 from tests.train.prediction.seen_scenes import MODEL
 
-__all__ = ["heuristic_run"]
 SIZES = {"arm_reach_m": [0.3, 1.0], "base_height_m": [0.5, 1.0], "camera_height_m": [0.8, 1.5]}
 
 
@@ -41,10 +39,6 @@ def untrained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def head_of(untrained: Path, *data: dict[str, Any]) -> CheckpointHead:
-    return replace(read_checkpoint(untrained).head, data=data)
-
-
 @given(st.sampled_from(ROBOT_SIZES), st.floats(0.02, 1.0), st.booleans())
 def test_a_size_beyond_the_range_is_noted(name: str, beyond_m: float, is_below: bool) -> None:
     robots = {n: (a, b) for n, (a, b) in SIZES.items()}
@@ -59,20 +53,19 @@ def test_a_size_beyond_the_range_is_noted(name: str, beyond_m: float, is_below: 
     assert not list(robot_notes(ModelScorer(scorer.model, "of an older checkpoint"), other))
 
 
-def test_a_checkpoint_has_the_sizes_of_all_its_runs(untrained: Path) -> None:
-    one, other = origin(robots=SIZES), origin(robots={**SIZES, "arm_reach_m": [1.11, 1.11]})
-    assert trained_robots(head_of(untrained, one, other))["arm_reach_m"] == (0.3, 1.11)
-    assert trained_robots(head_of(untrained, one)) == {n: (a, b) for n, (a, b) in SIZES.items()}
-    assert trained_robots(head_of(untrained, origin())) == trained_robots(head_of(untrained)) == {}
-
-
-def test_a_run_states_the_sizes_of_its_robots(heuristic_run: Path) -> None:
-    (found,) = SampleStream([heuristic_run]).origin()
-    assert found.get("robots") == SIZES
-
-
-def test_the_released_model_states_those_of_its_card() -> None:
-    assert load_scorer().robots == {name: (low, high) for name, (low, high) in SIZES.items()}
+def test_a_checkpoint_has_the_sizes_of_all_its_runs(untrained: Path, heuristic_run: Path) -> None:
+    head = read_checkpoint(untrained).head
+    (run,) = SampleStream([heuristic_run]).origin()
+    assert run.get("robots") == SIZES
+    other, sizes = origin(robots={**SIZES, "arm_reach_m": [1.11, 1.11]}), {n: (*r,) for n, r in SIZES.items()}
+    for data, expected in (
+        ((run, other), sizes | {"arm_reach_m": (0.3, 1.11)}),
+        ((run,), sizes),
+        ((origin(),), {}),
+        ((), {}),
+    ):
+        assert trained_robots(replace(head, data=data)) == expected
+    assert load_scorer().robots == sizes  # the released model's card says so, too
 
 
 @pytest.mark.parametrize("sizes", [{"arm_reach_m": [1.0]}, {"arm_reach_m": ["long", 1.0]}, [1.0, 2.0]])

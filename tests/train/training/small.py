@@ -31,13 +31,9 @@ TINY_PAPER: dict[str, Any] = {
 }
 
 
-def options_of(**changes: Any) -> Options:
+def job_of(runs: Path, out: Path, **changes: Any) -> TrainingJob:
     fields = {"stage": "stage1", "model": "shared", "model_config": TINY, "epochs": 2, "batch_scenes": 4}
-    return Options(**{**fields, **changes})
-
-
-def job_of(runs: Path, out: Path, val: Path | None = None, **changes: Any) -> TrainingJob:
-    return TrainingJob(options_of(**changes), (str(runs),), (str(val),) if val else (), str(out))
+    return TrainingJob(Options(**{**fields, **changes}), (str(runs),), (), str(out))
 
 
 class Recorder:
