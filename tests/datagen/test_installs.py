@@ -23,6 +23,7 @@ pytestmark = pytest.mark.slow
 
 __all__ = ["wheel"]
 Command = Sequence[str | Path]
+ROBOT = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2")
 MODEL = ("--model-config", "width=16", "--model-config", "embedding=32", "--model-config", "n_points=64")
 
 
@@ -110,6 +111,7 @@ def test_the_base_keeps_runs_and_names_what_it_lacks(wheel: Path, copied: Path, 
     lacks_train: list[Command] = [
         ["train", "stage1", copied, "--out", out],
         ["evaluate", "model.ckpt", copied],
+        ["predict", "model.ckpt", "--frame", "frame", *ROBOT],
     ]
     done = base.run(*works, ["doctor"], *lacks_labels, *lacks_train)
     for each in islice(done, len(works)):
@@ -155,8 +157,7 @@ def test_models_train_and_predict_without_simulators(wheel: Path, tmp_path: Path
         make_small_run(tmp_path / split, n, "--split", split)
     write_untrained(tmp_path / "model.ckpt", {})
     write_frame(tmp_path / "frame", draw_seen(0))
-    robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2")
-    given = ["--frame", "frame", *robot, "--out", "heat.png", "--html", "a.html"]
+    given = ["--frame", "frame", *ROBOT, "--out", "heat.png", "--html", "a.html"]
     helped, trained, predicted, reported = train.run(
         ["train", "--help"],
         ["train", "stage1", "train", "--val", "val", "--out", "a.ckpt", "--epochs", "1", *MODEL],
@@ -183,3 +184,13 @@ def test_models_are_judged_without_simulators(wheel: Path, tmp_path: Path) -> No
     assert judged.code == 0, judged
     assert "[sim]" in "".join(judged.out.split())  # why `reachability` is left out
     train.assert_lacks("sim", no_sim)
+
+
+@needs_sim
+def test_all_extras_label_on_ray_and_show_the_demonstration(wheel: Path, tmp_path: Path) -> None:
+    whole, few = Installed(wheel, tmp_path, "all"), ["--n", "48", "--candidates-per-scene", "8"]
+    (tmp_path / "plan.toml").write_text(CONFIG + "\n[arm.grasps]\nper_object = 40\nper_scene = 10\n")
+    plan = ["submit", "plan", "--out", "plan", "--candidates", "in-range", "--config", "plan.toml", *few]
+    for done in whole.run(plan, ["predict", "--demo"]):
+        assert done.code == 0, done
+    assert (tmp_path / "demo.png").is_file() and (tmp_path / "demo.html").is_file()

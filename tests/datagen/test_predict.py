@@ -7,6 +7,7 @@ import json
 import os
 import re
 import struct
+import sys
 import zipfile
 import zlib
 from pathlib import Path
@@ -393,11 +394,14 @@ def test_a_model_without_finite_scores_gives_no_answer(
     assert told.out == "" and words in told.err and told.err.count("\n") == 1
 
 
-def test_a_foreign_checkpoint(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "bad.ckpt").write_bytes(b"not a checkpoint")
-    given = arguments(made)
-    given[1] = str(tmp_path / "bad.ckpt")
-    refused(given, capsys, "bad.ckpt")
+def test_a_page_without_plotly_is_refused_before_anything_is_written(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "plotly", None)
+    monkeypatch.delitem(sys.modules, "datagen.train.prediction.page", raising=False)
+    written = ("--html", str(tmp_path / "page.html"), "--out", str(tmp_path / "a.png"))
+    refused(arguments(made, *written), capsys, "plotly: is not installed. Install the extra train: pip")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("z", [0.0, 1.0])
