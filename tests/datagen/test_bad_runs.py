@@ -1,4 +1,4 @@
-"""Places that are no run, damaged and hostile runs, and disks that are full or closed."""
+"""Places that are no run, damaged and hostile runs, and a full disk."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from datagen.schemas.record_files import signed_json
 from datagen.schemas.run import Run
 from tests.made_runs import check_digests
 from tests.refusals import refused
-from tests.small_runs import CONFIG, PER_SCENE, files_of, make_small_run, submit_arguments
+from tests.small_runs import CONFIG, PER_SCENE, files_of, submit_arguments
 
 
-@pytest.mark.parametrize("verb", ["status", "audit", "show"])
+@pytest.mark.parametrize("verb", ["status", "audit", "show", "verify", "verify --repair", "verify --clean"])
 @pytest.mark.parametrize("name", ["missing", "empty", "file", "foreign"])
 def test_a_place_that_is_no_run(
     verb: str, name: str, places: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = files_of(places["out"].parent)
     more = ["--out", str(places["out"]) + ".png"] if verb == "show" else []
-    refused([verb, str(places[name]), *more], capsys, str(places[name]))
+    refused([*verb.split(), str(places[name]), *more], capsys, str(places[name]))
     assert files_of(places["out"].parent) == before and not places["missing"].exists()
 
 
@@ -68,37 +68,15 @@ def _reseed(path: Path) -> None:
     _edit(path, lambda manifest: manifest["spec"].update(seed=9))
 
 
+def _lead_outside(path: Path) -> None:
+    _edit(path, lambda commit: commit["files"][0].update(path="../../secret"))
+
+
 DAMAGE: list[tuple[str, str, Callable[[Path], None], list[str]]] = [
     ("manifest cut", "manifest.json", _cut, []),
-    ("manifest empty", "manifest.json", lambda p: p.write_text("") and None, []),
-    ("manifest a list", "manifest.json", lambda p: p.write_text("[]") and None, []),
-    ("manifest huge", "manifest.json", lambda p: p.write_text("[" * (64 << 20)) and None, ["bytes"]),
-    ("manifest deep", "manifest.json", lambda p: p.write_text("[" * 100_000) and None, []),
     ("specification edited", "manifest.json", _reseed, ["spec_hash"]),
-    ("other format", "manifest.json", lambda p: _edit(p, lambda m: m.update(format_version=99)), ["99"]),
-    ("unknown key", "manifest.json", lambda p: _edit(p, lambda m: m.update(surprise=1)), ["surprise"]),
     ("commit cut", "commits/000000.json", _cut, []),
-    ("commit of binary", "commits/000000.json", lambda p: p.write_bytes(b"\xff\x00") and None, []),
-    (
-        "commit that leaves the run", "commits/000000.json",
-        lambda p: _edit(p, lambda c: c.update(attempt="../../../etc")), ["attempt"],
-    ),
-    (
-        "commit with a path that leaves the run", "commits/000000.json",
-        lambda p: _edit(p, lambda c: c["files"][0].update(path="../../secret")), ["files.0.path"],
-    ),
-    (
-        "commit of another shard", "commits/000000.json",
-        lambda p: _edit(p, lambda c: c.update(shard=1)), ["shard"],
-    ),
-    (
-        "commit of another run", "commits/000000.json",
-        lambda p: _edit(p, lambda c: c.update(spec_hash="0" * 64)), ["spec_hash"],
-    ),
-    (
-        "commit with more rows", "commits/000000.json",
-        lambda p: _edit(p, lambda c: c.update(samples=10**9)), ["samples", "1000000000"],
-    ),
+    ("commit with a path that leaves the run", "commits/000000.json", _lead_outside, ["files.0.path"]),
     (
         "commit of infinite cost", "commits/000000.json",
         lambda p: p.write_text(p.read_text().replace('"wall_s":', '"wall_s":1e999,"was":', 1)) and None, [],
@@ -170,22 +148,3 @@ def test_a_full_disk(tiny_disk: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert not (run / "data.zarr").exists()
     for commit in Run.open(run).commits():  # what counts is whole
         check_digests(Run.open(run), commit)
-
-
-def test_a_place_that_may_not_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    closed = tmp_path / "closed"
-    closed.mkdir()
-    # Everything is imported and loaded by a first run: another user may not read this interpreter.
-    make_small_run(tmp_path / "first", PER_SCENE)
-    is_root = os.geteuid() == 0
-    closed.chmod(0o555)
-    if is_root:
-        os.seteuid(65534)
-    try:
-        arguments = ["submit", "heuristic", "--n", "8", "--out", str(closed / "run"), "--workers", "0"]
-        refused(arguments, capsys, str(closed / "run"), "Permission denied")
-    finally:
-        if is_root:
-            os.seteuid(0)
-        closed.chmod(0o755)
-    assert list(closed.iterdir()) == []
