@@ -24,28 +24,19 @@ def _usual_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm")
 
 
-def do_four_of_eight(as_json: bool) -> None:
+@pytest.mark.parametrize("as_json", [True, False])
+def test_off_a_terminal_lines_say_how_far_it_is(as_json: bool, capsys: pytest.CaptureFixture[str]):
     clock = FakeClock()
     with steps("shards", 8, as_json, clock) as step:
         for clock.now_s in (4.0, 11.0, 12.0, 30.0):
             step()
-
-
-def test_json_lines_say_how_far_it_is(capsys: pytest.CaptureFixture[str]):
-    do_four_of_eight(as_json=True)
-    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
-    assert [(line["done"], line["of"], line["what"]) for line in lines] == [
-        (2, 8, "shards"),
-        (4, 8, "shards"),
-    ]
-    assert [line["per_s"] for line in lines] == [0.2, 0.1]
-    assert [line["left_s"] for line in lines] == [33, 30]
-
-
-def test_off_a_terminal_lines_are_text_unless_json_is_asked_for(capsys: pytest.CaptureFixture[str]):
-    do_four_of_eight(as_json=False)
     lines = capsys.readouterr().err.splitlines()
-    assert lines == ["shards 2/8  0/s  0:00:33 left", "shards 4/8  0/s  0:00:30 left"]
+    if as_json:
+        keys = ("done", "of", "what", "per_s", "left_s")
+        told = [tuple(json.loads(line)[key] for key in keys) for line in lines]
+        assert told == [(2, 8, "shards", 0.2, 33), (4, 8, "shards", 0.1, 30)]
+    else:
+        assert lines == ["shards 2/8  0/s  0:00:33 left", "shards 4/8  0/s  0:00:30 left"]
 
 
 def test_a_terminal_gets_a_bar_and_nothing_else_does(monkeypatch: pytest.MonkeyPatch):
@@ -56,14 +47,6 @@ def test_a_terminal_gets_a_bar_and_nothing_else_does(monkeypatch: pytest.MonkeyP
                 step()
         assert ("commits read" in stream.getvalue()) == shown
         assert ("3/3" in stream.getvalue()) == shown
-
-
-def open_and_count(as_json: bool) -> None:
-    clock = FakeClock()
-    with Progress(as_json, clock) as progress:
-        progress.phase("opening houses [and objects]")
-        progress.update("shards", 3, 4, lambda: ("2 retries", {"retries": 2}))
-        progress.phase("sealing")
 
 
 @pytest.mark.parametrize(
@@ -80,10 +63,14 @@ def open_and_count(as_json: bool) -> None:
         ),
     ],
 )
-def test_a_phase_is_named_when_it_begins_and_its_last_state_follows(
-    as_json: bool, told: list[str], capsys: pytest.CaptureFixture[str]
+def test_off_a_terminal_a_phase_is_named_when_it_begins_and_its_last_state_follows(
+    as_json: bool, told: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    open_and_count(as_json)
+    monkeypatch.setenv("FORCE_COLOR", "1")  # makes no terminal of a pipe
+    with Progress(as_json, FakeClock()) as progress:
+        progress.phase("opening houses [and objects]")
+        progress.update("shards", 3, 4, lambda: ("2 retries", {"retries": 2}))
+        progress.phase("sealing")
     assert capsys.readouterr().err.splitlines() == told
 
 
@@ -112,14 +99,6 @@ def test_an_interrupted_bar_gives_the_terminal_back(
         raise fail()
     assert sys.stderr is stream and stream.getvalue().rstrip().endswith("\x1b[?25h")  # the cursor is shown
     assert "1/3" in stream.getvalue()
-
-
-def test_the_variable_of_colours_makes_no_terminal_of_a_pipe(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    open_and_count(as_json=False)
-    assert "\x1b" not in capsys.readouterr().err
 
 
 def test_foreign_text_does_not_act_on_the_terminal():

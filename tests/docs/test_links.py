@@ -49,14 +49,18 @@ def anchors(page: Path) -> set[str]:
     return made
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
-def test_every_link_leads_somewhere(page: Path) -> None:
+def dead_links(page: Path) -> list[str]:
     dead: list[str] = []
     for link, file, anchor in links(page):
         inside = not page.is_relative_to(DOCS) or file.is_relative_to(DOCS)  # the site has nothing else
         if not (file.exists() and inside) or (anchor and anchor not in anchors(file)):
             dead.append(link)
-    assert not dead, f"{page.relative_to(REPOSITORY)}: {dead}"
+    return dead
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_every_link_leads_somewhere(page: Path) -> None:
+    assert dead_links(page) == []
 
 
 def test_every_page_is_in_the_sites_menu() -> None:
@@ -90,7 +94,4 @@ def test_a_dead_link_is_found(tmp_path: Path) -> None:
     page.write_text(
         "# A page\n\n[a](gone.md) [b](#a-page) [c](#gone) `[d](code.md)`\n\n```\n[e](code.md)\n```\n"
     )
-    dead = [
-        link for link, file, anchor in links(page) if not file.exists() or {anchor, ""} - anchors(file) - {""}
-    ]
-    assert dead == ["gone.md", "#gone"]
+    assert dead_links(page) == ["gone.md", "#gone"]

@@ -1,0 +1,51 @@
+"""Pages of reference say what the schemas say, and the example of a specification is a real one."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable
+
+import pytest
+
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.specification import (
+    ArmParams,
+    CandidateParams,
+    DisturbanceParams,
+    Source,
+    Specification,
+    TrialParams,
+)
+from scripts import data_format_page, specification_page
+from tests.conftest import REPOSITORY
+
+SOURCES = {"houses": Source(kind="a", digest="1" * 64), "objects": Source(kind="b", digest="2" * 64)}
+
+
+@pytest.mark.parametrize(
+    ("name", "page"), [("data-format", data_format_page.page), ("specification", specification_page.page)]
+)
+def test_a_page_is_up_to_date(name: str, page: Callable[[], str]) -> None:
+    assert (REPOSITORY / f"docs/reference/{name}.md").read_text("utf-8") == page(), "run `make docs`"
+
+
+def test_every_field_has_a_unit_or_is_a_name_and_says_what_it_means() -> None:
+    for schema in SCHEMAS.values():
+        for f in (*schema.scene_fields, *schema.sample_fields):
+            assert f.doc
+            assert (f.unit == "") == f.is_text, f.name
+            assert f"`{f.name}`" in data_format_page.page()
+
+
+def test_the_example_of_a_specification_has_the_defaults_also_where_it_comments_out() -> None:
+    example = re.search(r"```toml\n(.*?)```", specification_page.page(), re.DOTALL)
+    assert example is not None
+    fields = tomllib.loads(example[1])
+    assert Specification.model_validate(SOURCES | fields) == Specification.model_validate(SOURCES)
+    assert fields["candidates"]["per_scene"] == 60
+    fields = tomllib.loads(re.sub(r"^# ", "", example[1], flags=re.MULTILINE))
+    spec = Specification.model_validate(SOURCES | fields)
+    assert spec.arm == ArmParams(trial=TrialParams(), disturbance=DisturbanceParams())
+    assert set(fields["arm"]) == set(ArmParams.model_fields)
+    assert spec.candidates == CandidateParams(within="clear", scaled_base=True)
