@@ -63,7 +63,8 @@ def test_a_run_over_stored_scenes_is_not_extended_beyond_them(
     again = ["submit", "heuristic", "--scenes-from", str(source), "--out", str(run), *HERE]
     assert cli.run([*again, "--n", str(PER_SCENE)]) == 0
     refused(["resume", str(run), "--n", str(LONG_N), *HERE], capsys, "--n", "is more than the")
-    assert json_of(capsys, ["status", str(run)])["n"] == PER_SCENE
+    report = json_of(capsys, ["status", str(run)])
+    assert (report["n"], report["scenes_from"]) == (PER_SCENE, str(source))
     assert cli.run(["resume", str(run), "--n", str(N), *HERE]) == 0
     np.testing.assert_array_equal(arrays_of(run)["label"], arrays_of(source)["label"])
 

@@ -6,13 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-import zarr
 
 from datagen import cli
 from datagen.schemas.run import Run, open_runs
-from datagen.train.reader import SampleReader
 from tests.made_runs import make_run
 from tests.refusals import refused
 from tests.small_runs import arrays_of, assert_equal_runs, files_of, json_of, make_small_run
@@ -58,26 +55,6 @@ def test_runs_of_one_specification_give_the_store_of_one_run(
     assert files_of(out) == files
 
 
-def test_runs_of_several_specifications_give_one_store(merged: Path, apart: Path):
-    group = zarr.open_group(merged / "data.zarr", mode="r")
-    ids = np.asarray(group["sample_id"][...])
-    assert len(np.unique(ids, axis=0)) == len(ids) == N + N // 2
-    ours = {row.tobytes(): label for row, label in zip(ids, group["label"][...], strict=True)}
-    for name in ("whole", "other"):
-        arrays = arrays_of(apart / name)
-        for row, label in zip(arrays["sample_id"], arrays["label"], strict=True):
-            assert ours[row.tobytes()] == label
-
-
-@pytest.mark.parametrize("below", ["", "data.zarr"])
-def test_the_training_reader_takes_it_sealed_or_not(merged: Path, below: str):
-    reader = SampleReader([merged / below])
-    assert len(reader) == N + N // 2
-    assert reader.n_scenes == 9
-    read = np.concatenate([batch["sample_id"] for batch in reader.shards()])
-    np.testing.assert_array_equal(read, zarr.open_group(merged / "data.zarr", mode="r")["sample_id"][...])
-
-
 def test_every_reading_verb_takes_it(merged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     status = json_of(capsys, ["status", str(merged)])
     assert (status["labels"], status["n"], status["complete"]) == (N + N // 2, N + N // 2, True)
@@ -90,15 +67,6 @@ def test_every_reading_verb_takes_it(merged: Path, tmp_path: Path, capsys: pytes
     assert cli.run(["show", str(merged), "--scene", str(second), "--out", str(picture)]) == 0
     assert picture.stat().st_size > 10_000
     refused(["show", str(merged), "--scene", "9", "--out", str(picture)], capsys, "Give one from 0 to 8")
-
-
-def test_scenes_are_taken_from_one_of_its_parts(
-    merged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    arguments = ["submit", "heuristic", "--n", "8", "--out", str(tmp_path / "again"), "--workers", "0"]
-    told = refused([*arguments, "--scenes-from", str(merged)], capsys, "holds 2 merged runs", "/parts/")
-    for run in open_runs(merged):
-        assert run.storage.url in told
 
 
 def test_refusals_are_one_line(apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -122,12 +90,7 @@ def test_it_says_what_came_from_where_and_what_is_missing(tmp_path: Path, capsys
     assert cli.run(command) == 0
     told = " ".join(capsys.readouterr().out.split())
     words = (f"merged: {out}", "labels 30 of 40; missing shards: 1", f"datagen resume {out}", "3 linked")
-    for word in (
-        *words,
-        "1 duplicates",
-        f"{tmp_path}/a: 2 shards, made on test",
-        f"{tmp_path}/b: 1",
-    ):
+    for word in (*words, "1 duplicates", f"{tmp_path}/a: 2 shards, made on test", f"{tmp_path}/b: 1"):
         assert word in told, (word, told)
     make_run(tmp_path / "b", 40)
     assert cli.run(command) == 0

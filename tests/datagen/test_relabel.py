@@ -15,9 +15,10 @@ from datagen.train.run_parts import open_parts
 from tests.datagen.forged import forge
 from tests.made_runs import check_digests
 from tests.refusals import refused
-from tests.sim_extra import needs_sim
 from tests.small_runs import HERE, PER_SCENE, arrays_of, assert_equal_runs, files_of, json_of, make_small_run
+from tests.train.conftest import sim_run
 
+__all__ = ["sim_run"]
 SCENES = 6
 N = SCENES * PER_SCENE
 OWN = {"label", "heuristic_score", "sample_id"}  # what another rule changes
@@ -39,20 +40,6 @@ def relabelled(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_it_is_the_run_that_casting_rays_again_gives(source: Path, relabelled: Path, tmp_path: Path) -> None:
-    (tmp_path / "rule.toml").write_text(TOML)
-    again = ["--scenes-from", str(source), "--config", str(tmp_path / "rule.toml"), "--workers", "0"]
-    assert cli.run(["submit", "heuristic", "--n", str(N), "--out", str(tmp_path / "cast"), *again]) == 0
-    ours, theirs = Run.open(relabelled), Run.open(tmp_path / "cast")
-    assert ours.manifest.spec == theirs.manifest.spec and ours.n == theirs.n
-    assert ours.manifest.sources == theirs.manifest.sources
-    assert_equal_runs(arrays_of(relabelled), arrays_of(tmp_path / "cast"))
-    for mine, other in zip(ours.commits(), theirs.commits(), strict=True):
-        assert {e.path: e for e in mine.files} == {e.path: e for e in other.files}
-        assert (mine.positives, mine.redraws) == (other.positives, other.redraws)
-    assert (arrays_of(relabelled)["label"] != arrays_of(source)["label"]).any()
-
-
 def test_only_labels_scores_and_ids_are_written(source: Path, relabelled: Path) -> None:
     before, after = Run.open(source), Run.open(relabelled)
     written = set[str]()
@@ -72,12 +59,6 @@ def test_only_labels_scores_and_ids_are_written(source: Path, relabelled: Path) 
     assert all(c.cost.written_bytes < 12_000 for c in after.commits())
 
 
-def test_the_source_keeps_every_byte(source: Path, tmp_path: Path) -> None:
-    held = files_of(source)
-    assert cli.run(["relabel", str(source), "--out", str(tmp_path / "run"), "--tau", "0.3"]) == 0
-    assert files_of(source) == held
-
-
 def test_every_attempt_is_accounted_for(relabelled: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = Run.open(relabelled)
     ends = list(run.ledger.ends())
@@ -87,6 +68,8 @@ def test_every_attempt_is_accounted_for(relabelled: Path, capsys: pytest.Capture
         assert end.cost is not None and end.cost.wall_s >= sum(end.cost.stage_wall_s.values()) > 0
     report = json_of(capsys, ["status", str(relabelled)])
     assert report["complete"] and report["sealed"] and report["labels"] == N
+    assert report["positives"] == arrays_of(relabelled)["label"].sum()
+    assert report["attempts"] == {"committed": SCENES} and report["attempts_without_end"] == 0
 
 
 def test_the_cost_of_the_labels_it_came_from_is_carried_on(
@@ -117,11 +100,10 @@ def test_a_file_says_the_rule_and_an_option_wins_over_it(
     source: Path, relabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "rule.toml").write_text(TOML.replace("0.7", "0.9") + "tau = 0.4546\n")
-    out = tmp_path / "run"
-    told = json_of(
-        capsys,
-        ["relabel", str(source), "--out", str(out), "--config", str(tmp_path / "rule.toml"), "--mu", "0.7"],
-    )
+    out, held = tmp_path / "run", files_of(source)
+    rule = ["--config", str(tmp_path / "rule.toml"), "--mu", "0.7"]
+    told = json_of(capsys, ["relabel", str(source), "--out", str(out), *rule])
+    assert files_of(source) == held
     assert told["end"] == "complete" and told["labels"] == N
     before, after = arrays_of(source)["label"].astype(int), arrays_of(out)["label"].astype(int)
     assert (told["now_good"], told["now_bad"]) == ((after > before).sum(), (after < before).sum())
@@ -174,54 +156,35 @@ def test_a_relabelled_run_is_relabelled_from_the_same_scenes(
     )
 
 
-def test_merged_runs_are_relabelled_by_their_parts(
-    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    other = make_small_run(tmp_path / "other", PER_SCENE, "--seed", "5")
-    assert cli.run(["merge", str(source), str(other), "--out", str(tmp_path / "merged")]) == 0
-    refused(["relabel", str(tmp_path / "merged"), "--out", str(tmp_path / "run"), *RULE], capsys, "its parts")
-
-
 @pytest.mark.parametrize(
-    ("more", "words"),
+    ("text", "more", "words"),
     [
-        ((), ("heuristic", "has these parameters already", "--tau")),
-        (("--mu", "0.53", "--tau", "0.4546"), ("has these parameters already",)),
-        (("--mu", "nan"), ("heuristic.mu", "finite")),
-        (("--sigma-l", "0"), ("heuristic.sigma_l", "greater than 0")),
-        (("--d-min", "0.95"), ("heuristic", "d_max 0.92 must be above d_min 0.95")),
-        (("--distance", "far"), ("--distance",)),
-        (("--config", "missing.toml"), ("missing.toml", "cannot be read")),
+        ("", (), ("heuristic", "has these parameters already", "--tau")),
+        ("", ("--mu", "0.53", "--tau", "0.4546"), ("has these parameters already",)),
+        ("", ("--mu", "nan"), ("heuristic.mu", "finite")),
+        ("", ("--sigma-l", "0"), ("heuristic.sigma_l", "greater than 0")),
+        ("", ("--d-min", "0.95"), ("heuristic", "d_max 0.92 must be above d_min 0.95")),
+        ("", ("--distance", "far"), ("--distance",)),
+        ("", ("--config", "missing.toml"), ("missing.toml", "cannot be read")),
+        ("[visibility]\nwindow_px = 32\n", RULE, ("visibilities, which are stored", "--scenes-from")),
+        ("[scene]\nn_clutter = 3\n", RULE, ("scene",)),
+        ("[arm]\nrobot = 'panda'\n", RULE, ("arm", "heuristic has no arm")),
+        ("[heuristic]\nnu = 1\n", RULE, ("heuristic.nu",)),
+        ("heuristic = 3\n", RULE, ("heuristic",)),
     ],
 )
 def test_what_cannot_be_done_is_refused_before_anything_is_written(
+    text: str,
     more: tuple[str, ...],
     words: tuple[str, ...],
     source: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    out = tmp_path / "run"
-    refused(["relabel", str(source), "--out", str(out), *more], capsys, *words)
-    assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("[visibility]\nwindow_px = 32\n", ("visibility", "visibilities, which are stored", "--scenes-from")),
-        ("[scene]\nn_clutter = 3\n", ("scene",)),
-        ("[arm]\nrobot = 'panda'\n", ("arm", "heuristic has no arm")),
-        ("[heuristic]\nnu = 1\n", ("heuristic.nu",)),
-        ("heuristic = 3\n", ("heuristic",)),
-    ],
-)
-def test_a_file_may_change_the_rule_alone(
-    text: str, words: tuple[str, ...], source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
     (tmp_path / "rule.toml").write_text(text)
-    more = ["--config", str(tmp_path / "rule.toml"), "--tau", "0.5"]
-    refused(["relabel", str(source), "--out", str(tmp_path / "run"), *more], capsys, *words)
+    config = ("--config", str(tmp_path / "rule.toml")) if text else ()
+    refused(["relabel", str(source), "--out", str(tmp_path / "run"), *config, *more], capsys, *words)
+    assert not (tmp_path / "run").exists()
 
 
 def test_it_is_not_written_over_something_else(
@@ -266,22 +229,11 @@ def test_labels_of_another_version_of_the_code_are_not_mixed(
     refused(arguments, capsys, "engines.labels", "version 0", "--scenes-from")
 
 
-@needs_sim
 def test_labels_of_trials_do_not_follow_from_the_rule(
-    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    sim_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "arm.toml").write_text("[arm.grasps]\nper_object = 24\nper_scene = 2\n")
-    plan = tmp_path / "plan"
-    more = ["--scenes-from", str(source), "--config", str(tmp_path / "arm.toml"), "--workers", "0"]
-    assert cli.run(["submit", "plan", "--n", "8", "--out", str(plan), *more]) == 0
-    arguments = ["relabel", str(plan), "--out", str(tmp_path / "run"), *RULE]
-    refused(
-        arguments,
-        capsys,
-        "label_source",
-        "cannot be computed from distance",
-        "submit heuristic --scenes-from",
-    )
+    words = ("label_source", "cannot be computed from distance", "submit heuristic --scenes-from")
+    refused(["relabel", str(sim_run), "--out", str(tmp_path / "run"), *RULE], capsys, *words)
 
 
 def test_runs_on_s3_are_relabelled_and_replayed_there(

@@ -83,26 +83,11 @@ def test_a_run_of_stored_scenes_is_itself_a_source_of_the_same_scenes(again: Pat
     np.testing.assert_array_equal(arrays_of(third)["label"], arrays_of(again)["label"][: 2 * PER_SCENE])
 
 
-def test_it_resumes_and_extends_like_any_run(
-    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "run"
-    assert cli.run(again_arguments(source, out, 2 * PER_SCENE)) == 0
-    assert cli.run(again_arguments(source, out, 4 * PER_SCENE)) == 0
-    (out / "commits/000001.json").unlink()
-    assert cli.run(again_arguments(source, out, 4 * PER_SCENE)) == 0
-    np.testing.assert_array_equal(arrays_of(out)["label"], arrays_of(source)["label"][: 4 * PER_SCENE])
-    report = json_of(capsys, ["status", str(out)])
-    assert report["complete"] and report["scenes_from"] == Run.open(source).storage.url
-
-
 def test_more_than_the_source_has_is_refused_with_how_many_there_are(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "run"
-    refused(
-        again_arguments(source, out, N + 1), capsys, "--n", str(N + 1), f"is more than the {N} candidates"
-    )
+    out, words = tmp_path / "run", (f"--n: {N + 1}", f"is more than the {N} candidates")
+    refused(again_arguments(source, out, N + 1), capsys, *words)
     assert not out.exists()
     # A gap ends what can be used.
     holey = tmp_path / "holey"
@@ -113,32 +98,24 @@ def test_more_than_the_source_has_is_refused_with_how_many_there_are(
 
 
 @pytest.mark.parametrize(
-    "more",
+    ("more", "section", "place"),
     [
-        ("--seed", "3"),
-        ("--split", "val"),
-        ("--candidates", "clear"),
-        ("--candidates-per-scene", "9"),
+        (("--seed", "3"), "", "error: --seed: "),
+        (("--split", "val"), "", "error: --split: "),
+        (("--candidates", "clear"), "", "error: --candidates: "),
+        (("--candidates-per-scene", "9"), "", "error: --candidates-per-scene: "),
+        ((), "[candidates]\nper_scene = 9", "c.toml"),
+        ((), "seed = 3", "c.toml"),
+        ((), "[observation]\nn_points = 64", "c.toml"),
     ],
 )
-def test_options_that_decide_scenes_are_refused_with_scenes_from(
-    more: tuple[str, ...], source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    told = refused(again_arguments(source, tmp_path / "run", N, *more), capsys, more[0], "--scenes-from")
-    assert f"error: {more[0]}: " in told
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
-    "section", ["[candidates]\nper_scene = 9", "seed = 3", "[observation]\nn_points = 64"]
-)
-def test_such_sections_of_a_configuration_are_refused_too(
-    section: str, source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    config = tmp_path / "c.toml"
-    config.write_text(section)
-    arguments = again_arguments(source, tmp_path / "run", N, "--config", str(config))
-    refused(arguments, capsys, str(config), "--scenes-from")
+def test_what_decides_scenes_is_refused_with_scenes_from(
+    more: tuple[str, ...], section: str, place: str, source: Path, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    (tmp_path / "c.toml").write_text(section)
+    arguments = again_arguments(source, tmp_path / "run", N, "--config", str(tmp_path / "c.toml"), *more)
+    refused(arguments, capsys, place, "--scenes-from")
     assert not (tmp_path / "run").exists()
 
 
@@ -149,11 +126,6 @@ def test_a_robot_of_another_reach_is_refused_with_how_to_make_scenes_for_it(
     refused(arguments, capsys, str(source), "arm_reach_m", "submit heuristic --robot panda")
     fitting = make_small_run(tmp_path / "fitting", PER_SCENE, "--robot", "panda")
     assert cli.run(again_arguments(fitting, tmp_path / "run", PER_SCENE, "--robot", "panda")) == 0
-
-
-def test_a_place_without_a_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    refused(again_arguments(tmp_path / "none", tmp_path / "run", N), capsys, str(tmp_path / "none"))
-    assert not (tmp_path / "run").exists()
 
 
 def test_objects_may_have_moved_but_not_changed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -186,30 +158,6 @@ def test_a_damaged_source_gives_its_shard_up_and_no_label(source: Path, tmp_path
     assert run.quarantined() == {3} and len(run.committed()) == SCENES - 1
     (record,) = run.quarantine_records()
     assert isinstance(record, QuarantineRecord) and "points_m" in record.causes[-1]
-
-
-def test_the_audit_compares_runs_of_the_same_scenes(
-    source: Path, again: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    a, b = arrays_of(source), arrays_of(again)
-    report = json_of(capsys, ["audit", str(source), str(again)])
-    (account,) = report["sources"]
-    assert account["counts"]["label"] == 2 * N
-    (pair,) = report["agreement"]
-    assert [pair["run"], pair["reference_run"]] == [Run.open(place).storage.url for place in (source, again)]
-    near = (a["base_is_clear"] == 1) & (a["mount_distance_m"] <= a["arm_reach_m"])
-    said, true = a["label"][near] == 1, b["label"][near] == 1
-    assert pair["candidates"] == near.sum()
-    assert pair["counts"]["only_first"] == int((said & ~true).sum())
-    assert pair["counts"]["both"] == int((said & true).sum())
-
-
-def test_runs_of_other_scenes_and_a_run_twice_are_not_compared(
-    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    other = make_small_run(tmp_path / "other", PER_SCENE, "--seed", "1")
-    report = json_of(capsys, ["audit", str(source), str(other), str(source)])
-    assert report["agreement"] == []
 
 
 @pytest.mark.parametrize("within", ["clear", "in-range"])

@@ -39,20 +39,3 @@ def test_candidates_of_one_scene_are_one_observation(run: Run) -> None:
     low, high = found["interval"]
     assert found["equal_share"] == 0.75 and low < 0.75 < high
     assert high - low == pytest.approx(2 * 1.96 * np.sqrt(0.75 * 0.25 / 20), rel=0.15)
-
-
-def test_intervals_by_scene_cover_the_true_share(run: Run) -> None:
-    rng = np.random.default_rng(5)
-    scene, candidate = np.repeat(np.arange(60), 10).tolist(), np.tile(np.arange(10), 60).tolist()
-    held = 0
-    for _ in range(100):
-        share = np.repeat(rng.beta(4, 2, 60), 10)  # each scene has its own; their mean is 2/3
-        label = rng.random(600) < 0.5
-        said = np.where(rng.random(600) < share, label, ~label)
-        found = equal_share(
-            labels(run, scene, candidate, said.tolist(), [1] * 600),
-            labels(run, scene, candidate, label.tolist(), [1] * 600),
-        )
-        low, high = found["interval"]
-        held += low <= 2 / 3 <= high
-    assert 0.87 <= held / 100 <= 1
