@@ -12,63 +12,40 @@ from datagen import cli
 from datagen.configuration.stored_scenes import open_stored_scenes, specify_again
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
+from tests.datagen.conftest import PAIRED
 from tests.sim_extra import needs_sim
-from tests.small_runs import CONFIG, arrays_of, json_of, make_small_run
+from tests.small_runs import arrays_of, json_of
 
 pytestmark = needs_sim
 
-PER_SCENE, SCENES = 8, 2
-N = PER_SCENE * SCENES
-# Long arms, so that some candidates can be reached; few grasps, which are quickly found.
-LONG_ARMS = "[candidates]\narm_reach_m = {low = 0.9, high = 1.0}\nrobots_per_scene = 1\n"
-FEW_GRASPS = "[arm.grasps]\nper_object = 40\nper_scene = 10\n"
 
-
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A run of each label source, by its name, and one of disturbed trials, over the same candidates."""
-    folder = tmp_path_factory.mktemp("paired")
-    source = make_small_run(
-        folder / "heuristic", N, "--candidates", "in-range", config=CONFIG + LONG_ARMS, per_scene=PER_SCENE
-    )
-    (folder / "arm.toml").write_text(FEW_GRASPS)
-    made = {"heuristic": source}
-    for name, *more in (("plan",), ("sim",), ("disturbed", "--perturb", "2")):
-        made[name] = folder / name
-        assert cli.run([
-            "submit", "sim" if name == "disturbed" else name, "--n", str(N), "--out", str(made[name]),
-            "--scenes-from", str(source), "--config", str(folder / "arm.toml"), "--workers", "0", *more,
-        ]) == 0  # fmt: skip
-    return made
-
-
-def test_all_label_the_same_candidates_of_the_same_scenes(runs: dict[str, Path]) -> None:
-    arrays = {name: arrays_of(run) for name, run in runs.items()}
+def test_all_label_the_same_candidates_of_the_same_scenes(paired: dict[str, Path]) -> None:
+    arrays = {name: arrays_of(run) for name, run in paired.items()}
     first = arrays["heuristic"]
     for name in ("plan", "sim", "disturbed"):
         for column in first.keys() - {"sample_id", "label", "label_source", "label_version"}:
             np.testing.assert_array_equal(arrays[name][column], first[column], err_msg=f"{name} {column}")
         np.testing.assert_array_equal(arrays[name]["heuristic_label"], first["label"])
     ids = {row.tobytes() for a in arrays.values() for row in a["sample_id"]}
-    assert len(ids) == 4 * N
-    assert len({Run.open(run).manifest.spec.scenes_hash for run in runs.values()}) == 1
+    assert len(ids) == 4 * PAIRED
+    assert len({Run.open(run).manifest.spec.scenes_hash for run in paired.values()}) == 1
 
 
-def test_a_label_is_its_outcome_and_execution_begins_from_the_plan(runs: dict[str, Path]) -> None:
-    plan, sim, disturbed = (arrays_of(runs[name]) for name in ("plan", "sim", "disturbed"))
+def test_a_label_is_its_outcome_and_execution_begins_from_the_plan(paired: dict[str, Path]) -> None:
+    plan, sim, disturbed = (arrays_of(paired[name]) for name in ("plan", "sim", "disturbed"))
     success = list(OUTCOMES).index("success")
     for arrays in (plan, sim, disturbed):
         np.testing.assert_array_equal(arrays["label"] == 1, arrays["outcome"] == success)
     not_planned = plan["label"] == 0
-    assert 0 < not_planned.sum() < N
+    assert 0 < not_planned.sum() < PAIRED
     np.testing.assert_array_equal(sim["outcome"][not_planned], plan["outcome"][not_planned])
     assert (sim["trials"][not_planned] == 0).all() and (sim["trials"][~not_planned] == 1).all()
     assert (disturbed["trials"][~not_planned] == 2).all()
     assert not ({"base_collision"} & {list(OUTCOMES)[code] for code in plan["outcome"]})  # all are clear
 
 
-def test_specifications_hold_the_arm_and_what_moves_it(runs: dict[str, Path]) -> None:
-    plan, sim, disturbed = (Run.open(runs[name]).manifest for name in ("plan", "sim", "disturbed"))
+def test_specifications_hold_the_arm_and_what_moves_it(paired: dict[str, Path]) -> None:
+    plan, sim, disturbed = (Run.open(paired[name]).manifest for name in ("plan", "sim", "disturbed"))
     arms = [manifest.spec.arm for manifest in (plan, sim, disturbed)]
     assert all(arm is not None and arm.grasps.per_object == 40 for arm in arms)
     assert [arm is not None and arm.trial is not None for arm in arms] == [False, True, True]
@@ -76,11 +53,11 @@ def test_specifications_hold_the_arm_and_what_moves_it(runs: dict[str, Path]) ->
     for manifest in (plan, sim, disturbed):
         assert {"pin", "coal", "mani_skill", "sapien", "scenes", "labels"} <= manifest.spec.engines.keys()
         assert {"pin", "coal", "mani_skill"} <= manifest.libraries.keys()
-    assert not Run.open(runs["heuristic"]).manifest.spec.engines.keys() & {"pin", "coal", "mani_skill"}
+    assert not Run.open(paired["heuristic"]).manifest.spec.engines.keys() & {"pin", "coal", "mani_skill"}
 
 
-def test_the_arm_of_a_stored_run_stays_and_its_disturbance_does_not(runs: dict[str, Path]) -> None:
-    disturbed = open_stored_scenes(str(runs["disturbed"]), None, None, {})
+def test_the_arm_of_a_stored_run_stays_and_its_disturbance_does_not(paired: dict[str, Path]) -> None:
+    disturbed = open_stored_scenes(str(paired["disturbed"]), None, None, {})
     before = disturbed.run.manifest.spec
     again, planned, judged = (specify_again(name, disturbed, None) for name in ("sim", "plan", "heuristic"))
     assert before.arm is not None and again.arm is not None and planned.arm is not None
@@ -88,19 +65,19 @@ def test_the_arm_of_a_stored_run_stays_and_its_disturbance_does_not(runs: dict[s
     assert planned.arm == before.arm.model_copy(update={"disturbance": None, "trial": None})
     assert judged.arm is None
     assert {spec.scenes_hash for spec in (before, again, planned, judged)} == {before.scenes_hash}
-    assert again.hash() == Run.open(runs["sim"]).manifest.spec_hash  # the same labels, the same names
+    assert again.hash() == Run.open(paired["sim"]).manifest.spec_hash  # the same labels, the same names
 
 
 def test_the_audit_holds_every_source_against_the_next(
-    runs: dict[str, Path], capsys: pytest.CaptureFixture[str]
+    paired: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     # Named in another order: what is nearer to the truth counts as it.
-    places = [str(runs[name]) for name in ("disturbed", "plan", "heuristic", "sim")]
+    places = [str(paired[name]) for name in ("disturbed", "plan", "heuristic", "sim")]
     report = json_of(capsys, ["audit", *places])
     assert [source["label_source"] for source in report["sources"]] == ["heuristic", "plan", "sim"]
-    assert [source["counts"]["label"] for source in report["sources"]] == [N, N, 2 * N]
+    assert [source["counts"]["label"] for source in report["sources"]] == [PAIRED, PAIRED, 2 * PAIRED]
     assert [source["projection"]["paper_gpu_days"] for source in report["sources"]] == [3.0, None, 21.0]
-    plan = arrays_of(runs["plan"])
+    plan = arrays_of(paired["plan"])
     near = (plan["base_is_clear"] == 1) & (plan["mount_distance_m"] <= plan["arm_reach_m"])
     codes = list(OUTCOMES)
     counts = Counter(codes[code] for code in plan["outcome"][near].tolist())

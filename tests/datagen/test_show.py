@@ -17,42 +17,14 @@ from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_scene
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
 from datagen.workers.world import open_world
+from tests.datagen.conftest import PAIRED
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
-from tests.small_runs import CONFIG, arrays_of, make_small_run
+from tests.small_runs import arrays_of
 
 pytestmark = needs_sim
 
-PER_SCENE = 12
 NAMES = tuple(OUTCOMES)
-# One long arm, so that some candidates can be reached; few grasps, which are quickly found.
-ARM = """
-[candidates]
-arm_reach_m = {low = 0.9, high = 1.0}
-robots_per_scene = 1
-[arm.grasps]
-per_object = 40
-per_scene = 10
-"""
-
-
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The same candidates of one scene, labelled by each source; `disturbed` executes each plan twice."""
-    folder = tmp_path_factory.mktemp("shown")
-    scene, arm = ARM.split("[arm.grasps]")
-    choices = ["--candidates", "in-range", "--seed", "5"]
-    source = make_small_run(folder / "run", PER_SCENE, *choices, config=CONFIG + scene, per_scene=PER_SCENE)
-    made = {"heuristic": source}
-    (folder / "arm.toml").write_text("[arm.grasps]" + arm)
-    for name, *more in (("plan",), ("sim",), ("disturbed", "--perturb", "2")):
-        made[name] = folder / name
-        source = "sim" if name == "disturbed" else name
-        assert cli.run([
-            "submit", source, "--n", str(PER_SCENE), "--out", str(made[name]), "--workers", "0",
-            "--scenes-from", str(made["heuristic"]), "--config", str(folder / "arm.toml"), *more,
-        ]) == 0  # fmt: skip
-    return made
 
 
 def row_of(run: Path, success: bool) -> int:
@@ -70,24 +42,24 @@ def show(run: Path, out: Path, *more: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["plan", "sim"])
-def test_a_scene_is_drawn_with_its_outcomes(name: str, runs: dict[str, Path], tmp_path: Path) -> None:
-    pixels = show(runs[name], tmp_path / "scene.png")
+def test_a_scene_is_drawn_with_its_outcomes(name: str, paired: dict[str, Path], tmp_path: Path) -> None:
+    pixels = show(paired[name], tmp_path / "scene.png")
     assert pixels.shape == (792, 1320, 3)
     outcome_map = pixels[40:460, 420:800]
-    codes, counts = np.unique(arrays_of(runs[name])["outcome"], return_counts=True)
+    codes, counts = np.unique(arrays_of(paired[name])["outcome"], return_counts=True)
     for code in codes[counts > 2]:  # the stars of two picks may hide two
         colour = ImageColor.getrgb(OUTCOME_STYLES[NAMES[code]].colour)
         assert (outcome_map == colour).all(axis=2).sum() > 5, NAMES[code]
 
 
 @pytest.mark.parametrize("name", ["plan", "sim", "disturbed"])
-def test_a_candidate_tried_again_ends_as_it_is_stored(name: str, runs: dict[str, Path]) -> None:
+def test_a_candidate_tried_again_ends_as_it_is_stored(name: str, paired: dict[str, Path]) -> None:
     from datagen.drawing.trial_picture import try_again
 
-    run = Run.open(str(runs[name]))
+    run = Run.open(str(paired[name]))
     spec, rows = run.manifest.spec, read_scene(run, 0)
     scene = reconstruct_scene(open_world(spec, "builtin", "builtin"), rows.record)
-    for row in range(0, PER_SCENE, 2):
+    for row in range(0, PAIRED, 2):
         again = try_again(scene, reconstruct_candidates(rows.samples, scene), row, spec)
         assert again.trial.outcome == NAMES[rows.samples["outcome"][row]]
         recording = again.recording
@@ -99,28 +71,26 @@ def test_a_candidate_tried_again_ends_as_it_is_stored(name: str, runs: dict[str,
         assert recording.T_world_object.shape == (len(recording.phase), len(scene.models), 4, 4)
 
 
-def test_a_filmstrip(runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    row = row_of(runs["sim"], success=True)
-    pixels = show(runs["sim"], tmp_path / "trial.png", "--trial", str(row))
+@pytest.mark.parametrize("success", [True, False])
+def test_a_filmstrip_has_the_colour_of_its_outcome(
+    success: bool, paired: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    row = row_of(paired["sim"], success)
+    outcome = NAMES[arrays_of(paired["sim"])["outcome"][row]]
+    pixels = show(paired["sim"], tmp_path / "trial.png", "--trial", str(row))
     told = capsys.readouterr().out
-    assert pixels.shape[1] == 10 + 4 * 470 and f"candidate  {row} at" in told and "success" in told
-    assert tuple(pixels[20, 15]) == ImageColor.getrgb(OUTCOME_STYLES["success"].colour)
-
-
-def test_a_failure_shows_how_it_failed(runs: dict[str, Path], tmp_path: Path) -> None:
-    row = row_of(runs["sim"], success=False)
-    outcome = NAMES[arrays_of(runs["sim"])["outcome"][row]]
-    pixels = show(runs["sim"], tmp_path / "trial.png", "--trial", str(row))
+    assert f"candidate  {row} at" in told and outcome in told
+    assert pixels.shape[1] == 10 + 4 * 470 or not success
     assert tuple(pixels[20, 15]) == ImageColor.getrgb(OUTCOME_STYLES[outcome].colour)
 
 
 def test_a_film_of_the_best_success_moves(
-    runs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    paired: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "trial.gif"
     for name, size in (("WIDE_PX", (160, 120)), ("NEAR_PX", (160, 96))):
         monkeypatch.setattr(f"datagen.drawing.film.{name}", size)  # a tenth of the rays
-    show(runs["plan"], out)
+    show(paired["plan"], out)
     with Image.open(out) as image:
         frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(image)]
     assert len(frames) > 5 and all((a != b).any() for a, b in pairwise(frames))
@@ -131,7 +101,7 @@ def test_a_film_of_the_best_success_moves(
     [
         ("heuristic", ["--trial", "0", "--out", "a.png"], ["--trial", "heuristic"]),
         ("heuristic", ["--out", "a.gif"], ["--out", "heuristic", "plan or sim"]),
-        ("sim", ["--trial", str(PER_SCENE), "--out", "a.png"], ["--trial", f"0 to {PER_SCENE - 1}"]),
+        ("sim", ["--trial", str(PAIRED), "--out", "a.png"], ["--trial", f"0 to {PAIRED - 1}"]),
         ("sim", ["--trial", "-1", "--out", "a.png"], ["--trial", "-1"]),
         ("sim", ["--trial", "first", "--out", "a.png"], ["--trial", "first", "best"]),
         ("sim", ["--trial", "9" * 30, "--out", "a.png"], ["--trial"]),
@@ -141,12 +111,12 @@ def test_a_film_of_the_best_success_moves(
     ],
 )
 def test_what_cannot_be_shown(
-    name: str, arguments: list[str], words: list[str], runs: dict[str, Path], tmp_path: Path,
+    name: str, arguments: list[str], words: list[str], paired: dict[str, Path], tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    failed = str(row_of(runs["sim"], success=False))
+    failed = str(row_of(paired["sim"], success=False))
     filled = [a.replace("{failed}", failed) if a != arguments[-1] else str(tmp_path / a) for a in arguments]
-    refused(["show", str(runs[name]), *filled], capsys, *words)
+    refused(["show", str(paired[name]), *filled], capsys, *words)
     assert list(tmp_path.iterdir()) == []
 
 
