@@ -1,15 +1,20 @@
-"""A small benchmark on the built-in world: sampled candidates and whole grids, planned."""
+"""A small benchmark on the built-in world, planned, and checkpoints of tiny models that learned nothing."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
 from datagen import cli
 from datagen.evaluation.benchmark import Benchmark, BenchmarkRun, digests_of
 from datagen.schemas.run import Run
+from datagen.train.models import build_model
+from datagen.train.training.checkpoints import Checkpoint, CheckpointHead, write_checkpoint
 from tests.small_runs import GRID_CONFIG
+from tests.train.training.small import TINY
 
 SIDE = 5
 SIZES = {"test": 32, "grids": 6 * SIDE * SIDE}
@@ -37,3 +42,16 @@ def small_benchmark(tmp_path_factory: pytest.TempPathFactory) -> Path:
     text = Benchmark(version="small", runs=runs).model_dump_json(indent=1)
     (folder / "runs" / "benchmark.json").write_text(text)
     return folder / "runs"
+
+
+def checkpoint(path: Path, stage: str = "stage2", seed: int = 0, **said: Any) -> str:
+    """A file with random weights and with what its document says; its name."""
+    torch.manual_seed(seed)
+    model = build_model("shared", TINY)
+    plain: dict[str, Any] = {
+        "options": {}, "data": (), "val_data": (), "house_ids": ("elsewhere",), "object_digests": (),
+        "val_house_ids": (), "cost": {}, "versions": {}, "history": (),
+    }  # fmt: skip
+    head = CheckpointHead(model="shared", model_config=model.config, stage=stage, **{**plain, **said})
+    write_checkpoint(path, Checkpoint(head, dict(model.state_dict())))
+    return str(path)

@@ -61,15 +61,11 @@ def made(grids: Path) -> Path:
     return out
 
 
-def loop_in(report: dict[str, Any]) -> dict[str, Any]:
-    return report["closed_loop"]
-
-
 @pytest.mark.slow
 def test_without_error_the_outcome_is_the_label_and_two_processes_give_the_same(
     grids: Path, made: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    report = loop_in(json.loads((made / "loop.json").read_text()))
+    report = json.loads((made / "loop.json").read_text())["closed_loop"]
     stored = arrays_of(grids)
     label = stored["label"].reshape(SCENES, SIDE**2) == 1
     clear = stored["base_is_clear"].reshape(label.shape)
@@ -93,7 +89,7 @@ def test_without_error_the_outcome_is_the_label_and_two_processes_give_the_same(
             candidate, *error = key.split(" ")
             if not any(map(float, error)):
                 assert list(OUTCOMES)[outcome[k, int(candidate)]] == told
-    assert loop_in(json_of(capfd, words(grids, tmp_path, workers=2))) == report
+    assert json_of(capfd, words(grids, tmp_path, workers=2))["closed_loop"] == report
     assert outcomes_in(tmp_path) == outcomes_in(made)
 
 
@@ -135,12 +131,12 @@ def test_the_same_command_resumes_after_an_interrupt_and_makes_nothing_twice(
     assert sum(map(len, kept.values())) == 5 and all(
         kept[name].items() <= whole[name].items() for name in kept
     )
-    first = loop_in(json_of(capfd, words(grids, out)))
+    first = json_of(capfd, words(grids, out))["closed_loop"]
     assert calls == n and outcomes_in(out) == whole
-    assert first == loop_in(json.loads((made / "loop.json").read_text()))
+    assert first == json.loads((made / "loop.json").read_text())["closed_loop"]
     # Another method makes only its own arrivals; equal ones are there already.
     page = ["--out", str(out / "loop.html")]
-    more = loop_in(json_of(capfd, words(grids, out, "--baselines", "threshold-detector", *page)))
+    more = json_of(capfd, words(grids, out, "--baselines", "threshold-detector", *page))["closed_loop"]
     assert calls > n
     wider = outcomes_in(out)
     assert all(whole[name].items() <= wider[name].items() for name in whole)
@@ -153,7 +149,7 @@ def test_executed_trials_name_their_causes(
     grids: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     arguments = words(grids, tmp_path, "--execute", workers=1, scenes=1)
-    report = loop_in(json_of(capfd, arguments))
+    report = json_of(capfd, arguments)["closed_loop"]
     assert (report["mode"], report["arrivals_per_scene"], report["parts"][0]["scenes"]) == ("sim", 1, 1)
     (outcomes,) = outcomes_in(tmp_path).values()
     assert set(outcomes.values()) <= set(OUTCOMES) and "success" in outcomes.values()
@@ -167,7 +163,7 @@ def test_scenes_of_merged_runs_are_found(
 ) -> None:
     other, merged = submit(tmp_path / "other", grids.parent / "grid.toml", 2, 5), tmp_path / "merged"
     assert cli.run(["merge", str(grids), str(other), "--out", str(merged)]) == 0
-    report = loop_in(json_of(capfd, words(merged, tmp_path, scenes=99)))
+    report = json_of(capfd, words(merged, tmp_path, scenes=99))["closed_loop"]
     assert report["parts"][0]["scenes"] + report["scenes_without_good"] == SCENES + 2
     assert report["agreement"][0]["agree_with_nearest"] == 1
 

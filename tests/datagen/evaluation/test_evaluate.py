@@ -6,73 +6,34 @@ import json
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from datagen import cli
 from datagen.evaluation.methods import EvaluatedMethod
 from datagen.evaluation.report import Part, evaluation_report
 from datagen.evaluation.runs import candidate_sets_of, open_evaluated_runs
 from datagen.evaluation.score_files import ScoreFile
-from datagen.train.models import build_model
-from datagen.train.training.checkpoints import Checkpoint, CheckpointHead, write_checkpoint
+from tests.datagen.evaluation.conftest import SIDE, checkpoint
 from tests.datagen.evaluation.made_columns import make_columns
+from tests.datagen.html_report.page import Page
 from tests.made_runs import make_run
 from tests.sim_extra import needs_sim
-from tests.small_runs import CONFIG, arrays_of, json_of
+from tests.small_runs import arrays_of, json_of
 
 pytestmark = needs_sim
 
-SIDE, SCENES = 5, 6
+SCENES = 6
 CELLS = SIDE * SIDE
-GRID = f"[candidates]\ngrid_cells = {SIDE}\narm_reach_m = {{low = 0.9, high = 1.0}}\n"
-FEW_GRASPS = "[arm.grasps]\nper_object = 40\nper_scene = 10\n"
-TINY = {
-    "n_points": 64, "tokens": [4, 4, 4], "scales_m": [0.1], "width": 4, "embedding": 8, "head": [8],
-}  # fmt: skip
 QUICK = ("--baselines", "none")
 
 
 @pytest.fixture(scope="module")
-def grids(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Whole grids; sealed, to be read by other means too."""
-    folder = tmp_path_factory.mktemp("grids")
-    (folder / "grid.toml").write_text(CONFIG + GRID + FEW_GRASPS)
-    where = ["--out", str(folder / "run"), "--config", str(folder / "grid.toml"), "--workers", "0"]
-    n = str(SCENES * CELLS)
-    assert cli.run(["submit", "plan", "--n", n, "--candidates-per-scene", "grid", *where]) == 0
-    return folder / "run"
-
-
-def checkpoint(path: Path, stage: str = "stage2", seed: int = 0, **said: Any) -> str:
-    torch.manual_seed(seed)
-    model = build_model("shared", TINY)
-    plain: dict[str, Any] = {
-        "options": {}, "data": (), "val_data": (), "house_ids": ("elsewhere",), "object_digests": (),
-        "val_house_ids": (), "cost": {}, "versions": {}, "history": (),
-    }  # fmt: skip
-    head = CheckpointHead(model="shared", model_config=model.config, stage=stage, **{**plain, **said})
-    write_checkpoint(path, Checkpoint(head, dict(model.state_dict())))
-    return str(path)
-
-
-class Page(HTMLParser):
-    """The tags of a page, and the addresses that it asks for."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.addresses: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.addresses += [v for k, v in attrs if k in ("src", "href", "xlink:href", "srcset") and v]
+def grids(small_benchmark: Path) -> Path:
+    return small_benchmark / "grids"
 
 
 def test_tables_equal_counts_of_the_run(
@@ -80,8 +41,8 @@ def test_tables_equal_counts_of_the_run(
 ) -> None:
     stages = ("stage1", "sim-only", "stage2")
     files = [checkpoint(tmp_path / f"{stage}.pt", stage, seed) for seed, stage in enumerate(stages)]
-    page = tmp_path / "page.html"
-    report = json_of(capsys, ["evaluate", *files, str(grids), *QUICK, "--out", str(page)])
+    out = tmp_path / "page.html"
+    report = json_of(capsys, ["evaluate", *files, str(grids), *QUICK, "--out", str(out)])
     stored = arrays_of(grids)
     label, clear = stored["label"] == 1, stored["base_is_clear"]
     (part,) = report["parts"]
@@ -108,8 +69,22 @@ def test_tables_equal_counts_of_the_run(
     assert part["grids"]["scenes"] == SCENES
     assert part["grids"]["scenes_without_positive"] == SCENES - len(with_good)
     assert report["runs"][0]["parts"][0]["label_source"] == "plan"
-    assert page.stat().st_size < 3_000_000
-    _check_page(page.read_text(), n_sets=3)
+    assert out.stat().st_size < 3_000_000
+    page = Page(out.read_text())
+    text = page.source
+    # Each set has intervals and curves, and there is one picture of grids; nothing is loaded from elsewhere.
+    pictures = re.findall(r"<svg.*?</svg>", text, re.DOTALL)
+    assert len(pictures) == 2 * 3 + 1
+    for picture in pictures:
+        ET.fromstring(picture)
+    assert not {"script", "link", "iframe", "img"} & set(page.tags)
+    assert page.addresses and all(a.startswith(("#", "data:")) for a in page.addresses)
+    assert '<html lang="en">' in text and 'name="viewport"' in text and "prefers-color-scheme: dark" in text
+    assert "<title>Evaluation of base placement</title>" in text
+    # Tables scroll on phones.
+    assert text.count("<table") == text.count('<div class="scroll" tabindex="0"><table') > 0
+    for words in ("84.1", "94.7", "arXiv:2509.11594", "Table II:", "Table III:", "two-stage", "weights"):
+        assert words in text, words
 
 
 def test_a_candidate_set_is_reported_over_the_runs_that_cover_it(grids: Path) -> None:
@@ -128,24 +103,6 @@ def test_a_candidate_set_is_reported_over_the_runs_that_cover_it(grids: Path) ->
     report = evaluation_report({"random": 1.0}, methods, [], [Part("all", columns, sets)], [], {})
     clear = report["parts"][0]["sets"]["clear"]
     assert clear["count"] == (columns.is_clear & (columns.run[columns.scene] == 1)).sum()
-
-
-def _check_page(text: str, n_sets: int) -> None:
-    page = Page(text)
-    # Each set has intervals and curves, and there is one picture of grids; nothing is loaded from elsewhere.
-    pictures = re.findall(r"<svg.*?</svg>", text, re.DOTALL)
-    assert len(pictures) == 2 * n_sets + 1
-    for picture in pictures:
-        ET.fromstring(picture)
-    assert not {"script", "link", "iframe", "img"} & set(page.tags)
-    assert page.addresses and all(a.startswith(("#", "data:")) for a in page.addresses)
-    assert '<html lang="en">' in text and 'name="viewport"' in text and "prefers-color-scheme: dark" in text
-    assert "<title>Evaluation of base placement</title>" in text
-    assert (
-        text.count("<table") == text.count('<div class="scroll" tabindex="0"><table') > 0
-    )  # scroll on phones
-    for words in ("84.1", "94.7", "arXiv:2509.11594", "Table II:", "Table III:", "two-stage", "weights"):
-        assert words in text, words
 
 
 def test_the_same_command_gives_the_same_numbers_as_json_and_as_tables(
