@@ -15,7 +15,16 @@ from datagen.schemas.identity import sample_ids
 from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.record_files import shard_folder, utc_now
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Commit, Cost, FileEntry, Host, Layout, LedgerEntry, Manifest
+from datagen.schemas.run_records import (
+    Commit,
+    Cost,
+    FileEntry,
+    Host,
+    Layout,
+    LedgerEntry,
+    Manifest,
+    QuarantineRecord,
+)
 from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.specification import ObservationParams, SceneParams, Source, Specification
 from datagen.schemas.storage import open_storage
@@ -158,9 +167,23 @@ def values_of(schema: RecordSchema, f: Field, rows: int, rng: np.random.Generato
     return rng.integers(int(low), int(min(high, np.iinfo(dtype).max, 10**6)) + 1, shape).astype(dtype)
 
 
-def files_of(folder: Path) -> Mapping[str, bytes]:
-    """Every file below a folder, by relative path."""
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+def give_up(
+    run: Run, shard: int, *causes: str, attempts: tuple[str, ...] = ("a",), stack: str = "", at: str = ""
+) -> None:
+    """Put a shard into quarantine for these causes of its attempts, the first with a stack."""
+    scenes = run.layout.scenes_per_shard
+    record = QuarantineRecord(
+        shard=shard, seed=0, first_scene=shard * scenes, scenes=scenes, attempts=attempts, causes=causes,
+        stacks=(stack, *("" for _ in causes[1:])), created=at or utc_now(),
+    )  # fmt: skip
+    assert run.quarantine(record)
+
+
+def files_of(folder: Path, *below: str) -> dict[str, bytes]:
+    """Every file of a folder, or of some of the folders in it, by relative path."""
+    roots = [folder / name for name in below] or [folder]
+    files = [p for root in roots for p in sorted(root.rglob("*")) if p.is_file()]
+    return {str(p.relative_to(folder)): p.read_bytes() for p in files}
 
 
 def check_digests(run: Run, commit: Commit) -> None:

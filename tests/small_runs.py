@@ -12,6 +12,7 @@ import pytest
 import zarr
 
 from datagen import cli
+from tests.made_runs import files_of as files_of
 
 # Small frames, clouds and windows: everything a full run does, at a fraction of its time.
 CONFIG = """
@@ -72,13 +73,6 @@ def assert_equal_runs(a: Mapping[str, np.ndarray[Any, Any]], b: Mapping[str, np.
     for name in a:
         assert a[name].dtype == b[name].dtype, name
         np.testing.assert_array_equal(a[name], b[name], err_msg=name)
-
-
-def files_of(folder: Path, *below: str) -> dict[str, bytes]:
-    """Every file of a run, or of some of its folders, by relative path."""
-    roots = [folder / name for name in below] or [folder]
-    files = [p for root in roots for p in sorted(root.rglob("*")) if p.is_file()]
-    return {str(p.relative_to(folder)): p.read_bytes() for p in files}
 
 
 def json_of(capture: pytest.CaptureFixture[str], arguments: list[str]) -> Any:

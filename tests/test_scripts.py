@@ -65,12 +65,14 @@ def names_of(requirements: list[str]) -> set[str]:
     return {Requirement(line).name for line in requirements} - {DISTRIBUTION}
 
 
-def test_every_dependency_is_pinned() -> None:
+def test_every_dependency_is_pinned_and_the_base_brings_no_simulator_and_no_learner() -> None:
     lines = (SCRIPTS.parent / "constraints.txt").read_text().splitlines()
     pinned = {line.partition("==")[0] for line in lines if line and not line.startswith("#")}
     asked = [*project()["dependencies"], *chain(*project()["optional-dependencies"].values())]
     assert names_of(asked) <= pinned
     assert all(line.startswith("#") or "==" in line for line in lines if line)
+    heavy = {pip_name for extra in EXTRAS.values() for pip_name in extra.brings.values()}
+    assert not names_of(project()["dependencies"]) & heavy
 
 
 def test_errors_and_the_doctor_know_the_extras_of_the_package() -> None:
@@ -80,11 +82,6 @@ def test_errors_and_the_doctor_know_the_extras_of_the_package() -> None:
     for name, extra in EXTRAS.items():
         asked = [line for line in extras[name] if ">= '3.13'" not in line]
         assert names_of(asked) == set(extra.brings.values()), name
-
-
-def test_the_base_package_brings_no_simulator_and_no_learner() -> None:
-    heavy = {pip_name for extra in EXTRAS.values() for pip_name in extra.brings.values()}
-    assert not names_of(project()["dependencies"]) & heavy
 
 
 def test_progress_tells_what_pip_does() -> None:

@@ -88,10 +88,8 @@ def test_what_is_told_is_so(trials: Path, tmp_path: Path, capsys: pytest.Capture
     for name, params in (("before", told["heuristic"]["before"]), ("fitted", told["heuristic"]["after"])):
         said = heuristic(*inputs, HeuristicParams(**params))[1] == 1
         assert told[name]["accuracy"]["value"] == pytest.approx((said == label).mean())
-    gain = told["gain"]["accuracy"]
-    assert gain["value"] == pytest.approx(
-        told["after"]["accuracy"]["value"] - told["before"]["accuracy"]["value"]
-    )
+    after, before = (told[name]["accuracy"]["value"] for name in ("after", "before"))
+    assert told["gain"]["accuracy"]["value"] == pytest.approx(after - before)
 
 
 def test_the_file_says_where_it_comes_from_and_is_the_same_again(
@@ -104,15 +102,10 @@ def test_the_file_says_where_it_comes_from_and_is_the_same_again(
         told = calibrated(trials, Path("rule.toml"), capsys)
         texts.append(Path("rule.toml").read_text())
     assert texts[0] == texts[1]
-    head = [line.removeprefix("# ") for line in texts[0].splitlines() if line.startswith("#")]
-    words = "\n".join(head)
-    for word in (
-        Run.open(trials).manifest.spec_hash,
-        f"n {told['samples']}",
-        "split val",
-    ):
-        assert word in words
-    assert f"{100 * told['after']['balanced_accuracy']['value']:.1f}" in words
+    head = "\n".join(line for line in texts[0].splitlines() if line.startswith("# "))
+    share = f"{100 * told['after']['balanced_accuracy']['value']:.1f}"
+    for word in (Run.open(trials).manifest.spec_hash, f"n {told['samples']}", "split val", share):
+        assert word in head
 
 
 def test_runs_are_calibrated_to_together_and_odd_splits_are_said(
@@ -129,13 +122,6 @@ def test_runs_are_calibrated_to_together_and_odd_splits_are_said(
     assert "warning: " in shown.err and "split is test" in shown.err
     assert rule_in(out).model_dump() == told["heuristic"]["after"]  # whatever the run's name
     assert "split test" in out.read_text()
-
-
-def test_a_file_that_is_there_stays(trials: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "rule.toml"
-    out.write_text("mine")
-    refused(["calibrate", str(trials), "--out", str(out)], capsys, str(out), "already exists")
-    assert out.read_text() == "mine"
 
 
 def test_what_cannot_be_fitted_to_is_refused(
@@ -163,21 +149,17 @@ def test_what_cannot_be_fitted_to_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("out", "distance", "told"),
     [
-        (["--out", "rule.txt"], "a .toml file"),
-        (["--out", "nowhere/rule.toml"], "folder"),
-        (["--out", "rule.toml", "--distance", "crow"], "--distance"),
+        ("rule.txt", "planar", "a .toml file"),
+        ("nowhere/rule.toml", "planar", "folder"),
+        ("rule.toml", "crow", "--distance"),
+        ("there.toml", "planar", "there.toml: --out: already exists"),
     ],
 )
-def test_odd_options_are_refused(
-    words: list[str],
-    told: str,
-    trials: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+def test_odd_options_are_refused_and_a_file_that_is_there_stays(
+    out: str, distance: str, told: str, trials: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    refused(["calibrate", str(trials), *words], capsys, told)
-    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "there.toml").write_text("mine")
+    refused(["calibrate", str(trials), "--out", str(tmp_path / out), "--distance", distance], capsys, told)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]

@@ -15,12 +15,12 @@ import pytest
 from datagen import cli
 from datagen.schemas.jobs import Jobs, StoredJob
 from datagen.schemas.storage import open_storage
+from tests.conftest import REPOSITORY
 from tests.refusals import refused
 from tests.small_runs import PER_SCENE, json_of, submit_arguments
 
 pytestmark = pytest.mark.slow
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 N = 64 * PER_SCENE  # eight shards
 
 
@@ -69,15 +69,6 @@ def test_another_process_sees_and_stops_a_job(tmp_path: Path, capsys: pytest.Cap
     assert [e["event"] for e in events] == ["job_began", "job_ended"]
     assert cli.run(["cancel", str(run)]) == 0
     assert "none is running" in capsys.readouterr().out
-
-
-def test_cancel_now_ends_the_job_at_once(tmp_path: Path) -> None:
-    work = Work(tmp_path / "run")
-    work.wait_until_it_makes_shards()
-    assert cli.run(["cancel", str(tmp_path / "run"), "--now"]) == 0
-    assert work.process.wait(800) == 130
-    job = work.job()
-    assert job.stop == "now" and job.state is not None and job.state.end == "interrupted"
 
 
 def test_cancel_does_not_wait_for_a_killed_job(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -36,7 +36,7 @@ def content(name: str) -> dict[str, Any]:
     return json.loads((FOLDER / name).read_bytes())
 
 
-def test_the_file_is_the_one_on_the_card() -> None:
+def test_the_file_the_benchmark_and_the_page_are_those_of_the_card() -> None:
     card, path = content(released.CARD), released.released_checkpoint()
     data = path.read_bytes()
     assert len(data) == card["bytes"] < 5_000_000
@@ -49,20 +49,14 @@ def test_the_file_is_the_one_on_the_card() -> None:
     assert (head.model, head.model_config, head.stage) == (card["model"], card["config"], card["stage"])
     assert (len(head.house_ids), len(head.object_digests)) == (card["houses"], card["objects"])
     assert [dict(each) for each in head.data] == card["data"]
-
-
-def test_the_metrics_on_the_card_are_of_the_shipped_benchmark() -> None:
-    card, shipped = content(released.CARD), read_benchmark()
+    shipped = read_benchmark()
     assert card["benchmark"] == {"version": shipped.version, "digest": shipped.digest()}
     assert list(card["metrics"]) == ["test", "test-known", "trials", "grids, mixed", "grids, hard"]
-
-
-def test_the_page_is_written_from_the_facts() -> None:
-    page = card_text(content(released.CARD), (FOLDER / released.RECIPE).read_text("utf-8"))
+    page = card_text(card, (FOLDER / released.RECIPE).read_text("utf-8"))
     assert page == (FOLDER / released.CARD_PAGE).read_text("utf-8")
 
 
-def test_no_file_names_a_folder_of_a_machine() -> None:
+def test_no_file_names_a_folder_of_a_machine_and_the_sample_frame_names_its_sources() -> None:
     for path in FOLDER.rglob("*"):
         if path.is_file() and path.suffix in (".json", ".md", ".safetensors"):
             text = path.read_bytes()
@@ -70,8 +64,6 @@ def test_no_file_names_a_folder_of_a_machine() -> None:
                 text = text[8 : 8 + int.from_bytes(text[:8], "little")]  # its JSON header
             assert not re.search(rb"(?<![\w.:/>-])/[\w.-]+/", text), path
 
-
-def test_the_sample_frame_is_small_and_names_its_sources() -> None:
     frame = released.sample_frame()
     assert sum(path.stat().st_size for path in frame.iterdir()) < 400_000
     told = (frame / "ATTRIBUTION.md").read_text("utf-8")
@@ -156,7 +148,7 @@ def test_releasing_another_model_writes_file_and_card(
 
     assert release() == 2
     assert "has no line of the weights" in capsys.readouterr().err
-    assert (copy / released.CHECKPOINT).read_bytes() == released_bytes()
+    assert (copy / released.CHECKPOINT).read_bytes() == (FOLDER / released.CHECKPOINT).read_bytes()
     board["methods"][0]["checkpoint"]["weights_sha256"] = weights_sha256(scorer.model)
     assert release() == 0
     card = json.loads((copy / released.CARD).read_bytes())
@@ -164,7 +156,3 @@ def test_releasing_another_model_writes_file_and_card(
     assert card["bytes"] == (copy / released.CHECKPOINT).stat().st_size
     assert card["sha256"][:12] in (copy / released.CARD_PAGE).read_text()
     assert card["metrics"]["test"]["balanced_accuracy"] == value
-
-
-def released_bytes() -> bytes:
-    return (REPOSITORY / "datagen" / "released" / released.CHECKPOINT).read_bytes()

@@ -17,7 +17,8 @@ from datagen.jobs.job import Job, JobOptions, JobRun
 from datagen.schemas.quarantine import lifted_records
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.run import Run, open_runs
-from datagen.schemas.run_records import Manifest, QuarantineRecord
+from datagen.schemas.run_records import Manifest
+from tests.made_runs import give_up
 from tests.refusals import refused
 from tests.small_runs import (
     HERE,
@@ -47,16 +48,6 @@ def lose(run: Path, *shards: int) -> None:
         shutil.rmtree(run / f"shards/{shard:06d}")
         for file in run.glob(f"ledger/{shard:06d}-*"):
             file.unlink()
-
-
-def give_up(run: Path, *shards: int) -> None:
-    for shard in shards:
-        Run.open(run).quarantine(
-            QuarantineRecord(
-                shard=shard, seed=0, first_scene=shard, scenes=1, attempts=("a",), stacks=("",),
-                causes=("failed: no luck",), created="2026-01-01T00:00:00.000+00:00",
-            )
-        )  # fmt: skip
 
 
 def test_missing_shards_are_made_and_committed_ones_stay(finished: Path, copied: Path) -> None:
@@ -108,7 +99,8 @@ def test_quarantined_shards_are_tried_again_only_with_quarantined(
     finished: Path, copied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lose(copied, 2, 5)
-    give_up(copied, 2, 5)
+    for shard in (2, 5):
+        give_up(Run.open(copied), shard, "failed: no luck")
     assert cli.run(["resume", str(copied), *HERE]) == 1
     told = capsys.readouterr()
     assert "2 shards (2, 5)" in told.out and "no luck" in told.err
@@ -128,7 +120,8 @@ def test_the_quarantined_share_of_the_whole_run_decides_the_exit_code(
     copied: Path, share: float, code: int
 ) -> None:
     lose(copied, 2, 5, 7)
-    give_up(copied, 2, 5)
+    for shard in (2, 5):
+        give_up(Run.open(copied), shard, "failed: no luck")
     run = Run.open(copied)
     policy = RetryPolicy(max_quarantined_share=share)
     job = Job(run.storage, str(copied), [JobRun(run, "builtin", "builtin")], IN_PROCESS, 0.0, policy=policy)

@@ -11,8 +11,8 @@ import pytest
 from datagen import cli
 from datagen.schemas.quarantine import lift_quarantine
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import LedgerEntry, Outcome, QuarantineRecord
-from tests.made_runs import make_run
+from datagen.schemas.run_records import LedgerEntry, Outcome
+from tests.made_runs import give_up, make_run
 from tests.small_runs import json_of
 
 SEGFAULT = "Fatal Python error: Segmentation fault"
@@ -42,12 +42,7 @@ def troubled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     attempts = (end(run, 1, 2, "crashed", SEGFAULT, STACK), end(run, 1, 6, "failed", "ValueError: no rays"))
     end(run, 3, 4, "lost", "node died")
     end(run, 3, 8, "out_of_memory", "MemoryError")
-    run.quarantine(
-        QuarantineRecord(
-            shard=1, seed=0, first_scene=2, scenes=2, attempts=attempts, causes=causes, stacks=(STACK, ""),
-            created=at(9),
-        )
-    )  # fmt: skip
+    give_up(run, 1, *causes, attempts=attempts, stack=STACK, at=at(9))
     return Path(run.storage.url)
 
 
@@ -120,12 +115,7 @@ def test_log_of_a_run_without_events_says_so(tmp_path: Path, capsys: pytest.Capt
 
 def test_a_lifted_quarantine_stays_in_the_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = make_run(tmp_path / "run", n=20, shards=[0])
-    run.quarantine(
-        QuarantineRecord(
-            shard=1, seed=0, first_scene=2, scenes=2, attempts=("a", "b"), causes=("x", "y"), stacks=("", ""),
-            created=at(1),
-        )
-    )  # fmt: skip
+    give_up(run, 1, "x", "y", attempts=("a", "b"), at=at(1))
     assert lift_quarantine(run) == [1]
     (event,) = lines_of(capsys, run.storage.url)
     assert event["event"] == "quarantined" and "tried again later" in event["text"]

@@ -1,4 +1,4 @@
-"""Whole runs through the command line: made, resumed, extended, killed, interrupted, read."""
+"""Whole runs through the command line: made, resumed, killed, interrupted, read."""
 
 from __future__ import annotations
 
@@ -8,19 +8,15 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 from collections import Counter
 from pathlib import Path
 
-import numpy as np
 import pytest
-import xarray
-import zarr
 
 from datagen import cli
-from datagen.schemas.fields import sized_schema
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import QuarantineRecord
+from tests.conftest import REPOSITORY
+from tests.made_runs import give_up
 from tests.refusals import refused
 from tests.small_runs import (
     PER_SCENE,
@@ -33,7 +29,6 @@ from tests.small_runs import (
 )
 from tests.workers.objects.toy_set import write_bundle
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 N, LONG_N = 8 * PER_SCENE, 16 * PER_SCENE
 
 
@@ -47,28 +42,6 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def finished_long(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Sixteen scenes of the same specification, two a shard, made without interruption."""
     return make_small_run(tmp_path_factory.mktemp("long") / "run", LONG_N)
-
-
-def test_stock_readers_read_it_without_a_warning(finished: Path) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        group = zarr.open(str(finished / "data.zarr"), mode="r")
-        data = xarray.open_zarr(finished / "data.zarr")
-    assert isinstance(group, zarr.Group)
-    run = Run.open(finished)
-    schema = sized_schema("heuristic", run.manifest.spec)
-    fields = {**dict.fromkeys(schema.scene_fields, "scene"), **dict.fromkeys(schema.sample_fields, "sample")}
-    assert set(group.array_keys()) == {f.name for f in fields}
-    assert data.sizes["sample"] == N and data.sizes["scene"] == N // PER_SCENE
-    for f, table in fields.items():
-        array, seen = group[f.name], data[f.name]
-        assert isinstance(array, zarr.Array)
-        assert array.metadata.dimension_names == (table, *f.dims) == seen.dims
-        assert array.shape == seen.shape
-        assert array.attrs.get("units", "") == f.unit == seen.attrs.get("units", "")
-        assert array.attrs["long_name"] == f.doc
-    assert set(np.unique(data["label"].values)) == {0, 1}
-    assert {"spec_hash", "specification", "schema_version"} <= set(group.attrs)
 
 
 def test_the_same_command_again_does_nothing_and_says_so(
@@ -90,12 +63,7 @@ def test_a_run_with_shards_given_up_says_so_again(copied: Path, capsys: pytest.C
     run, arrays = Run.open(copied), arrays_of(copied)
     for shard in (2, 5):
         (copied / f"commits/{shard:06d}.json").unlink()
-        run.quarantine(
-            QuarantineRecord(
-                shard=shard, seed=0, first_scene=shard, scenes=1, attempts=(), causes=("failed: no luck",),
-                stacks=(), created="",
-            )
-        )  # fmt: skip
+        give_up(run, shard, "failed: no luck")
     capsys.readouterr()
     assert cli.run(submit_arguments(copied, N)) == 1
     told = capsys.readouterr()
@@ -104,16 +72,6 @@ def test_a_run_with_shards_given_up_says_so_again(copied: Path, capsys: pytest.C
     shutil.rmtree(copied / "quarantine")  # as the message says
     assert cli.run(submit_arguments(copied, N)) == 0
     assert_equal_runs(arrays_of(copied), arrays)
-
-
-def test_a_larger_n_extends_and_shard_size_changes_no_array(copied: Path, finished_long: Path) -> None:
-    before = files_of(copied, "shards", "commits", "ledger", "plans")
-    assert cli.run(submit_arguments(copied, LONG_N)) == 0
-    after = files_of(copied, "shards", "commits", "ledger", "plans")
-    assert before.items() <= after.items() and len(after) > len(before)
-    layouts = [Run.open(place).layout.scenes_per_shard for place in (copied, finished_long)]
-    assert layouts == [1, 2]
-    assert_equal_runs(arrays_of(copied), arrays_of(finished_long))
 
 
 @pytest.mark.parametrize(
@@ -134,17 +92,6 @@ def test_another_specification_is_refused_and_changes_nothing(
     before = files_of(finished)
     refused([*arguments, *more], capsys, str(finished), *fields)
     assert files_of(finished) == before
-
-
-def test_status_counts_what_is_there(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    report = json_of(capsys, ["status", str(finished)])
-    labels = arrays_of(finished)["label"]
-    assert report["complete"] and report["sealed"]
-    assert (report["n"], report["labels"], report["positives"]) == (N, N, int(labels.sum()))
-    assert report["shards"] == {"planned": 8, "committed": 8, "quarantined": [], "missing": 0}
-    assert report["attempts"] == {"committed": 8} and report["attempts_without_end"] == 0
-    assert cli.run(["status", str(finished)]) == 0
-    assert "64 of 64" in capsys.readouterr().out
 
 
 def test_status_tells_an_older_seal(copied: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from datagen import cli
+from tests.made_runs import files_of
 
 
 def ycb_folder(folder: Path, *, path: str = "{key}/a.obj", n: int = 10, **more: object) -> Path:
@@ -25,10 +26,6 @@ def ycb_folder(folder: Path, *, path: str = "{key}/a.obj", n: int = 10, **more: 
     return folder
 
 
-def files_below(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
 def test_objects_are_split_by_their_names(tmp_path: Path) -> None:
     source, out = ycb_folder(tmp_path / "ycb"), tmp_path / "out"
     assert cli.run(["assets", "split", str(source), str(out)]) == 0
@@ -37,13 +34,13 @@ def test_objects_are_split_by_their_names(tmp_path: Path) -> None:
     }
     assert keys["test"] == ["004_thing", "009_thing"]
     assert sorted(keys["train"] + keys["test"]) == [f"{i:03}_thing" for i in range(10)]
-    before = files_below(out)
+    before = files_of(out)
     assert before["test/009_thing/a.obj"] == b"009_thing" and len(before) == 12
     assert cli.run(["assets", "split", str(source), str(out)]) == 0
-    assert files_below(out) == before
+    assert files_of(out) == before
     # One of its own results, split again into the place where it lies.
     assert cli.run(["assets", "split", str(out / "train"), str(out)]) == 2
-    assert files_below(out) == before
+    assert files_of(out) == before
 
 
 @pytest.mark.parametrize(

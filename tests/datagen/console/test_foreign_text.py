@@ -11,8 +11,8 @@ from datagen.console.printing import print_lines, print_rows
 from datagen.display.html_page import escape
 from datagen.schemas.jobs import JobRecord, Jobs, JobState
 from datagen.schemas.lineage import LINEAGE, ShardOrigin, encode_lineage
-from datagen.schemas.run_records import LedgerEntry, QuarantineRecord
-from tests.made_runs import make_run
+from datagen.schemas.run_records import LedgerEntry
+from tests.made_runs import give_up, make_run
 
 # A colour, the clipboard (OSC 52), a bell, a carriage return, C1 controls, text that runs backwards, markup.
 EVIL = (
@@ -32,23 +32,13 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
         attempt=ATTEMPT, shard=1, outcome="failed", cause=EVIL, stack=stack, started=AT, ended=AT
     )
     run.ledger.end(entry)
-    given_up = QuarantineRecord(
-        shard=1, seed=0, first_scene=2, scenes=2, attempts=(ATTEMPT,), causes=(EVIL,), stacks=(stack,),
-        created=AT,
-    )  # fmt: skip
-    run.quarantine(given_up)
+    give_up(run, 1, EVIL, attempts=(ATTEMPT,), stack=stack, at=AT)
+    jobs = Jobs(run.storage)
     for number, end in enumerate(("failed", "")):
         job = f"20260101T00000{number}-aaaaaaaa"
-        jobs = Jobs(run.storage)
-        jobs.begin(
-            JobRecord(
-                id=job, command=("submit", EVIL), host=EVIL, pid=1, started=AT, address=EVIL, submission=EVIL,
-                jobs_api=EVIL,
-            )
-        )  # fmt: skip
-        jobs.put_state(
-            JobState(id=job, updated=AT, phase="making", end=end, cause=EVIL, stopping=EVIL)
-        )  # fmt: skip
+        evil = dict.fromkeys(("host", "address", "submission", "jobs_api"), EVIL)
+        jobs.begin(JobRecord(id=job, command=("submit", EVIL), pid=1, started=AT, **evil))
+        jobs.put_state(JobState(id=job, updated=AT, phase="making", end=end, cause=EVIL, stopping=EVIL))
         if not end:
             jobs.ask_to_stop(job, at_once=False)
     origin = ShardOrigin(address=f"/runs/{EVIL}", created=AT, platform=EVIL, code_version=EVIL)

@@ -14,7 +14,6 @@ from datagen.drawing.film import Film, filmstrip_moments, write_animation, write
 from datagen.drawing.posed_robot import RobotBodies, robot_bodies
 from datagen.workers.rendering.embree import RayScene, cast_pixels
 from datagen.workers.scenes.reconstruct import ReconstructedScene
-from datagen.workers.trials import Recording
 from tests.datagen.drawing.trials_to_draw import base_pose, cut, recalled, recording_of, robot
 from tests.workers.worlds import ROOM_M, box_body, table_house
 
@@ -55,19 +54,15 @@ def whole(film: Film, view: film_module.View, row: int) -> RayScene:
     return RayScene(view.house, stage.objects, stage.radii_m, stage.T_world_object)
 
 
-def test_a_trial_has_eight_moments_in_order(film: Film) -> None:
+def test_a_trial_has_eight_moments_in_order_from_its_first_row_to_its_last(film: Film) -> None:
     phases = [film.recording.phase[row] for row, _ in film.moments]
     assert phases == ["reach", "reach", "reach", "approach", "close", "lift", "lift", "hold"]
+    for rows in (1, 2, 5, 13, 20):
+        shown = [row for row, _ in filmstrip_moments(cut(film.recording, rows))]
+        assert shown == sorted(set(shown)) and (shown[0], shown[-1]) == (0, rows - 1)
 
 
-@pytest.mark.parametrize("rows", [1, 2, 5, 13, 20])
-def test_moments_begin_and_end_with_the_recording(film: Film, rows: int) -> None:
-    recording: Recording = cut(film.recording, rows)
-    shown = [row for row, _ in filmstrip_moments(recording)]
-    assert shown == sorted(set(shown)) and (shown[0], shown[-1]) == (0, rows - 1)
-
-
-def test_the_gap_between_the_fingers_is_the_opening(bodies: RobotBodies) -> None:
+def test_the_robot_stands_on_the_floor_with_its_fingers_apart_by_the_opening(bodies: RobotBodies) -> None:
     q, T = bodies.robot.homes_rad[0], base_pose()
     left, right = bodies.hand
     gaps = []
@@ -78,10 +73,6 @@ def test_the_gap_between_the_fingers_is_the_opening(bodies: RobotBodies) -> None
         inside = (poses[left, :3, 3] - T_tcp[:3, 3]) @ T_tcp[:3, 1]
         assert inside >= -1e-9  # finger 0 is on the side of +y
     assert gaps[0] - gaps[1] == pytest.approx(0.06, abs=1e-9)
-
-
-def test_the_robot_stands_on_the_floor(bodies: RobotBodies) -> None:
-    poses = bodies.poses(base_pose(), bodies.robot.homes_rad[0], 0.08)
     heights = [rays.mesh.vertices_m @ T[2, :3] + T[2, 3] for rays, T in zip(bodies.rays, poses, strict=True)]
     assert min(float(z.min()) for z in heights) == pytest.approx(0.0, abs=1e-6)
 

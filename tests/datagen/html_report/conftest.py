@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import LedgerEntry, QuarantineRecord
+from datagen.schemas.run_records import LedgerEntry
 from tests.datagen.forged import Columns, forge
+from tests.made_runs import give_up
 from tests.small_runs import PER_SCENE, make_small_run
 
 # Texts that act in a browser, a terminal or matplotlib if they are not escaped.
@@ -43,13 +44,6 @@ def hostile(reported: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def quarantine(run: Run, shard: int, text: str) -> None:
     """Add a failed attempt of a shard, and its quarantine, with this cause and stack."""
     attempt, stack = f"{shard:06d}-aaaaaaaa-000001", f"Traceback of {text}\n  line 2: {text}"
-    run.ledger.end(
-        LedgerEntry(
-            attempt=attempt, shard=shard, outcome="failed", cause=text, stack=stack, started=AT, ended=AT
-        )
-    )
-    record = QuarantineRecord(
-        shard=shard, seed=0, first_scene=shard, scenes=1, attempts=(attempt,), causes=(text,),
-        stacks=(stack,), created=AT,
-    )  # fmt: skip
-    assert run.quarantine(record)
+    entry = LedgerEntry(attempt=attempt, shard=shard, outcome="failed", cause=text, stack=stack)
+    run.ledger.end(entry.model_copy(update={"started": AT, "ended": AT}))
+    give_up(run, shard, text, attempts=(attempt,), stack=stack, at=AT)

@@ -51,12 +51,6 @@ def run(detached: Detached) -> Path:
     return detached.run
 
 
-@pytest.fixture
-def first_key(detached: Detached) -> str:
-    """The key of the shell that started the head."""
-    return detached.key
-
-
 def head_and_jobs() -> tuple[Head, RayJobs]:
     head = running_head()
     assert head is not None
@@ -70,10 +64,10 @@ def await_end(jobs: RayJobs, submission: str) -> str:
 
 
 def test_each_job_on_a_head_has_its_own_credentials_and_nothing_shows_them(
-    run: Path, first_key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Path, detached: Detached, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     head, jobs = head_and_jobs()
-    keys, submissions = [first_key, secrets.token_hex(16)], ["datagen-a", "datagen-b"]
+    keys, submissions = [detached.key, secrets.token_hex(16)], ["datagen-a", "datagen-b"]
     program, go = tmp_path / "program.py", tmp_path / "go"
     program.write_text(PROGRAM)
     for key, submission in zip(keys, submissions, strict=True):
@@ -130,7 +124,7 @@ def test_nothing_of_the_shell_travels_to_another_cluster(
 
 
 @needs_root
-def test_another_user_sees_nothing_of_a_head(run: Path, first_key: str) -> None:
+def test_another_user_sees_nothing_of_a_head(run: Path) -> None:
     head, _ = head_and_jobs()
     tried = as_another_user(
         "from pathlib import Path\n"

@@ -8,10 +8,10 @@ import pytest
 
 from datagen import cli
 from datagen.reports.spending import QUARANTINED, account_for
-from datagen.schemas.record_files import encode_record, end_key, utc_now
+from datagen.schemas.record_files import encode_record, end_key
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Cost, LedgerEntry, Outcome, QuarantineRecord
-from tests.made_runs import attempt, make_run, write
+from datagen.schemas.run_records import Cost, LedgerEntry, Outcome
+from tests.made_runs import attempt, give_up, make_run, write
 
 
 def end(run: Run, name: str, shard: int, outcome: Outcome, cost: Cost | None, cause: str = "") -> None:
@@ -29,12 +29,7 @@ def run(tmp_path: Path) -> Run:
     end(made, "b-3", 3, "lost", None)
     for k in range(3):
         end(made, f"c-{k}", 4, "failed", Cost(wall_s=1 / 3, cpu_s=1 / 7), "ValueError: never")
-    made.quarantine(
-        QuarantineRecord(
-            shard=4, seed=0, first_scene=8, scenes=2, attempts=("c-0", "c-1", "c-2"), causes=("never",),
-            stacks=("",), created=utc_now(),
-        )
-    )  # fmt: skip
+    give_up(made, 4, "never", attempts=("c-0", "c-1", "c-2"))
     return made
 
 
