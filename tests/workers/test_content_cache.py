@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -13,7 +14,12 @@ import pytest
 
 from datagen.schemas.safe_files import whole_file
 from datagen.workers.content_cache import Arrays, CacheFolder
+from datagen.workers.houses import open_houses
+from datagen.workers.objects import open_objects
+from datagen.workers.world import World, assemble_world
+from tests.made_runs import small_spec
 from tests.other_user import as_another_user, needs_root
+from tests.workers.objects.toy_set import write_bundle
 
 THINGS = CacheFolder("things", most_files=3)
 CONTENT: Arrays = {
@@ -141,3 +147,20 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
 def test_a_user_without_a_home_has_no_cache_in_a_shared_folder() -> None:
     code = "from datagen.workers.content_cache import cache_folder\nprint(cache_folder())"
     assert as_another_user(code, user=54321).split() == ["/dev/null/.cache/datagen"]
+
+
+def test_a_second_start_of_a_world_reads_no_object(tmp_path: Path) -> None:
+    cache, folder = tmp_path / "cache", write_bundle(tmp_path / "set", *(f"{k:03d}_cube" for k in range(9)))
+
+    def start() -> World:
+        objects = open_objects(f"ycb:{folder}")
+        return assemble_world(small_spec(), open_houses("builtin"), objects, "builtin", str(folder))
+
+    first = start()
+    shutil.rmtree(cache / "objects")
+    second = start()
+    assert not (cache / "objects").exists()
+    assert second.target_names == first.target_names == first.object_names
+    assert second.objects.digest == first.objects.digest
+    shutil.rmtree(cache)
+    assert start().target_names == first.target_names

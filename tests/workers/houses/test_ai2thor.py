@@ -49,21 +49,6 @@ def export(path: Path, meshes: list[trimesh.Trimesh]) -> None:
     path.write_bytes(trimesh.Scene(meshes).export(file_type="glb"))
 
 
-def instance(
-    name: str, at: tuple[float, float, float], rotation: tuple = (1, 0, 0, 0), **more: object
-) -> dict:
-    return {"template_name": f"objects/{name}", "translation": list(at), "rotation": list(rotation), **more}
-
-
-def table_meshes() -> list[trimesh.Trimesh]:
-    legs = [
-        box((0.06, 0.7, 0.06), (sx * 0.65, -0.02, sz * 0.35), (90, 60, 40))
-        for sx in (-1, 1)
-        for sz in (-1, 1)
-    ]
-    return [box((1.4, 0.04, 0.8), (0, 0.35, 0), (160, 120, 80)), *legs]
-
-
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """Two rooms, 4 x 3 m each, beside each other along the files' x; the wall between has a gap."""
@@ -77,7 +62,9 @@ def root(tmp_path: Path) -> Path:
     ]
     export(hab / "assets/stages/iTHOR/home.glb", stage)
     export(hab / "assets/stages/ProcTHOR/turned.glb", stage)
-    export(plain / "assets/objects/Dining_Table_9.glb", table_meshes())
+    legs = [box((0.06, 0.7, 0.06), (x, -0.02, z), (90, 60, 40)) for x in (-0.65, 0.65) for z in (-0.35, 0.35)]
+    top = box((1.4, 0.04, 0.8), (0, 0.35, 0), (160, 120, 80))
+    export(plain / "assets/objects/Dining_Table_9.glb", [top, *legs])
     export(plain / "assets/objects/Bed_1.glb", [box((1.4, 0.5, 2.0), (0, 0, 0), (90, 90, 140))])
     export(plain / "assets/objects/Mug_1.glb", [textured_box((0.1, 0.1, 0.1), (200, 30, 40))])
     types = {"DiningTable": 3, "Bed": 4, "Mug": 5}
@@ -87,11 +74,14 @@ def root(tmp_path: Path) -> Path:
         config = plain / f"configs/objects/{name}.object_config.json"
         config.parent.mkdir(parents=True, exist_ok=True)
         config.write_text(json.dumps({"semantic_id": number}))
+    places = (
+        ("Dining_Table_9", [2.0, 0.37, 1.2], [HALF, 0, HALF, 0]),
+        ("Bed_1", [6.5, 0.25, 1.2], [1, 0, 0, 0]),
+        ("Mug_1", [2.1, 0.79, 1.2], [1, 0, 0, 0]),
+        ("Missing_1", [1, 0, 1], [1, 0, 0, 0]),
+    )
     things = [
-        instance("Dining_Table_9", (2.0, 0.37, 1.2), (HALF, 0, HALF, 0)),
-        instance("Bed_1", (6.5, 0.25, 1.2)),
-        instance("Mug_1", (2.1, 0.79, 1.2)),
-        instance("Missing_1", (1, 0, 1)),
+        {"template_name": f"objects/{name}", "translation": at, "rotation": turn} for name, at, turn in places
     ]
     for folder, stage_name in (("iTHOR", "stages/iTHOR/home"), ("ProcTHOR/1", "stages/ProcTHOR/turned")):
         scene = {"stage_instance": {"template_name": stage_name}, "object_instances": things}

@@ -1,4 +1,4 @@
-"""Known answers: frames, walls and holes, what rests where, tops of corner counters."""
+"""Known answers: frames, walls and holes, what rests where, tops of corner counters, any floor."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.houses import open_houses
 from datagen.workers.houses.house import House
 from datagen.workers.houses.loader import unity_rotation
+from datagen.workers.houses.walls_and_floors import clean_polygon, triangles
 from tests.workers.houses.house_checks import check_house, covers, top_below_m
 from tests.workers.houses.house_files import thing, two_rooms, wall, write_houses, xyz
 
@@ -213,3 +215,41 @@ def test_a_tilted_bat_keeps_its_centre(tmp_path: Path):
     vertices = body(load(tmp_path, document), "0|bat").visual.vertices_m
     np.testing.assert_allclose((vertices.min(0) + vertices.max(0)) / 2, [2, 1.5, 0.5], atol=1e-5)
     assert np.ptp(vertices[:, 1]) == pytest.approx(0.96, abs=1e-5)
+
+
+def area(p: np.ndarray) -> float:
+    q = np.roll(p, -1, axis=0)
+    return float(0.5 * (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum())
+
+
+@given(st.integers(3, 40), st.integers(0, 2**32 - 1), st.booleans())
+@settings(max_examples=100, deadline=None)
+def test_triangles_fill_any_star_shaped_polygon(corners: int, seed: int, is_clockwise: bool):
+    rng = np.random.default_rng(seed)
+    angle = np.sort((np.arange(corners) + rng.uniform(0, 0.9, corners)) * 2 * np.pi / corners)
+    radius = rng.uniform(1.0, 5.0, corners)
+    polygon = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
+    cleaned = clean_polygon(polygon[::-1] if is_clockwise else polygon)
+    if isinstance(cleaned, str):
+        assert corners < 5  # three or four corners may leave the centre out
+        return
+    pieces = [cleaned[list(t)] for t in triangles(cleaned)]
+    assert len(pieces) == len(cleaned) - 2
+    assert all(area(t) >= -1e-9 for t in pieces)
+    assert np.isclose(sum(area(t) for t in pieces), area(cleaned))
+    middles = np.array([t.mean(0) for t in pieces if area(t) > 1e-6])
+    assert inside_polygon(middles, cleaned).all()
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=50, deadline=None)
+def test_rooms_with_right_angles_and_repeated_corners(seed: int):
+    rng = np.random.default_rng(seed)
+    a, b, c, d = rng.uniform(1, 4, 4)
+    polygon = np.array(
+        [[0, 0], [a + b, 0], [a + b, 0], [a + b, c], [a, c], [a, c + d], [a / 2, c + d], [0, c + d]]
+    )
+    cleaned = clean_polygon(polygon)
+    assert not isinstance(cleaned, str)
+    assert len(cleaned) == 6
+    assert np.isclose(sum(area(cleaned[list(t)]) for t in triangles(cleaned)), (a + b) * c + a * d)

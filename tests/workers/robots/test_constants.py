@@ -1,10 +1,12 @@
-"""Constants of the robots' files against the URDFs and meshes that they cite."""
+"""Constants of the robots' files against the URDFs and meshes that they cite; the URDF that is written."""
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
@@ -19,6 +21,7 @@ from datagen.workers.robots.fetch import FETCH
 from datagen.workers.robots.hulls import MAX_CORNERS, mesh_hulls, outer_hull, read_points
 from datagen.workers.robots.panda import FRANKA_HAND, PANDA, PANDA_SCALED
 from datagen.workers.robots.robot import Robot
+from datagen.workers.robots.robot_files import write_urdf
 from datagen.workers.robots.urdf import Inertial, UrdfTree, read_urdf, scaled_inertial
 from datagen.workers.robots.xarm7 import XARM7
 
@@ -161,3 +164,20 @@ def test_without_the_extension_the_hand_would_meet_the_forearm() -> None:
     }
     # They touch in most poses, and the rule that drops such pairs would hide it.
     assert ("panda_link5", "panda_hand") in pairs[0.05] - pairs[0.0]
+
+
+@pytest.mark.parametrize("reach_m", [0.35, 0.8])
+def test_parts_in_written_files_are_those_of_the_links(tmp_path: Path, reach_m: float) -> None:
+    robot = open_robot("panda-scaled", reach_m, 0.8)
+    tree = read_urdf(write_urdf(robot, tmp_path))
+    assert len(tree.joints) == 10 and not any(link.visuals for link in tree.links.values())
+    for name, parts in zip(robot.link_names, robot.link_parts_m, strict=True):
+        shapes = tree.link(name).collisions
+        assert len(shapes) == len(parts)
+        for shape, part in zip(shapes, parts, strict=True):
+            assert shape.mesh is not None
+            mesh = trimesh.load_mesh(shape.mesh)
+            assert mesh.is_watertight and mesh.volume > 0
+            gaps = np.linalg.norm(np.asarray(mesh.vertices)[:, None] - part[None], axis=2)
+            assert gaps.min(axis=1).max() < 1e-6
+            np.testing.assert_allclose(mesh.bounds, [part.min(axis=0), part.max(axis=0)], atol=1e-6)
