@@ -103,13 +103,6 @@ def test_later_grasps_are_scored_when_asked_for(monkeypatch: pytest.MonkeyPatch)
     assert [grasps.holds(row) for row in (0, known + BLOCK)] == [True, asked[0] >= 0.5]
 
 
-def test_another_draw_gives_other_grasps() -> None:
-    model, params = ORDER[0], GraspParams(per_object=BLOCK, min_score=0.0)
-    first, other = (grasps_of(model, GRIPPER, params, draw) for draw in (0, 1))
-    assert len(first) == len(other) and not same(first, other)
-    assert same(other, grasps_of(model, GRIPPER, params, 1))
-
-
 def test_a_bowl_is_taken_by_its_rim() -> None:
     """One finger inside: the closing axis is level and the hand is over the wall, not over the middle."""
     bowl = bowl_model()
@@ -146,12 +139,14 @@ def test_objects_that_cannot_be_grasped_have_no_grasps() -> None:
     assert scored_grasps(heavy, GRIPPER, FEW.per_object).score.max() < 0.5
 
 
-def test_parameters_choose_how_many_and_how_good() -> None:
+def test_parameters_choose_how_many_and_how_good_and_another_draw_gives_others() -> None:
     box = box_model("tall", (0.06, 0.05, 0.2), mass_kg=1.0)
     all_of_them = grasps_of(box, GRIPPER, GraspParams(per_object=30, min_score=0.0))
     good = grasps_of(box, GRIPPER, GraspParams(per_object=30, min_score=0.7))
     assert (good.score >= 0.7).all() and len(good) == (all_of_them.score >= 0.7).sum()
     assert len(grasps_of(box, GRIPPER, GraspParams(per_object=1, min_score=0.0))) == 1
+    other = grasps_of(box, GRIPPER, GraspParams(per_object=30, min_score=0.0), draw=1)
+    assert len(other) == len(all_of_them) and not same(other, all_of_them)
 
 
 def test_content_alone_decides() -> None:

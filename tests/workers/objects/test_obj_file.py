@@ -101,7 +101,6 @@ HEAD = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n"
 BAD = {
     "no faces": (HEAD, "no faces"),
     "NaN": ("v 0 nan 0\nf 1 1 1\n", "line 1"),
-    "infinite": (HEAD + "v 0 0 1e999\nf 1 2 3\n", "line 5"),
     "words for numbers": (HEAD + "v a b c\nf 1 2 3\n", "line 5"),
     "two corners": (HEAD + "f 1 2\n", "line 5"),
     "index 0": (HEAD + "f 0 1 2\n", "line 5"),

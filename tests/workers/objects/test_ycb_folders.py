@@ -38,10 +38,8 @@ def test_seams_are_split_and_colours_sit_where_the_texture_says(tmp_path: Path) 
     assert mesh.texture is not None
     assert len(mesh.vertices_m) > 8, "corners with several texture coordinates must be split"
     assert len(mesh.faces) == 12
-    normals = np.cross(
-        mesh.vertices_m[mesh.faces[:, 1]] - mesh.vertices_m[mesh.faces[:, 0]],
-        mesh.vertices_m[mesh.faces[:, 2]] - mesh.vertices_m[mesh.faces[:, 0]],
-    )
+    a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
     top = normals[:, 2] > 1e-9
     # The top carries the right half of the image (u from 0.5 to 1), which is blue; the rest is red.
     np.testing.assert_array_equal(mesh.face_rgb[top], [[0, 0, 255]] * 2)

@@ -25,7 +25,6 @@ from datagen.workers.robots import open_robot, robot_limits
         ("panda", 0.8, 0.8, "reach of 0.947 m"),
         ("panda", None, -0.1, "at least 0.0 m"),
         ("panda", None, math.nan, "at least 0.0 m"),
-        ("panda", None, math.inf, "at least 0.0 m"),
         ("fetch", None, 0.5, "from 0.727 to 1.112 m"),
         ("fetch", None, 1.2, "from 0.727 to 1.112 m"),
         ("fetch", 1.0, 0.8, "reach of 1.11 m"),
