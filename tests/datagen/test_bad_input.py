@@ -112,6 +112,13 @@ def test_an_unknown_label_source(source: str, tmp_path: Path, capsys: pytest.Cap
 CONFIGS: list[tuple[str, list[str]]] = [
     ("n_clutter = 3", ["n_clutter", "Remove or correct the key"]),
     ("[scene]\nclutter = 3", ["scene.clutter", "docs/reference/specification.md"]),
+    ("[scene]\nn_clutter = -1", ["scene.n_clutter", "-1"]),
+    ("[scene]\nmax_retries = 0", ["scene.max_retries"]),
+    ("[observation]\nn_points = 10", ["observation.n_points", "64"]),
+    ("[observation.noise]\nbaseline_m = 0", ["observation.noise.baseline_m"]),
+    ("[visibility]\nwindow_px = 4", ["visibility.window_px", "8"]),
+    ("[candidates]\ngrid_cells = 1", ["candidates.grid_cells"]),
+    ("[heuristic]\nalpha = 1.5", ["heuristic.alpha", "1"]),
     ("[scene]\nn_clutter = 31", ["scene.n_clutter", "30"]),
     ("[scene]\nn_clutter = 'six'", ["scene.n_clutter", "six", "integer"]),
     ("[scene]\nn_clutter = 2.5", ["scene.n_clutter", "2.5"]),

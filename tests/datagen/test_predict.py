@@ -188,7 +188,7 @@ def bad_files(folder: Path) -> None:
     (folder / "list.json").write_text("[1, 2")
     T = np.eye(4)
     T[2, 3] = 1.0
-    poses = {"pose_nan": T * np.nan, "pose_mirror": T * [[-1], [1], [1], [1]]}
+    poses = {"pose_nan": T * np.nan, "pose_mirror": T * [[-1], [1], [1], [1]], "pose_wide": T * 2}
     for name, pose in poses.items():
         (folder / f"{name}.json").write_text(json.dumps({"T_world_camera": pose.tolist()}))
     (folder / "pose_rows.json").write_text(json.dumps([[1, 0, 0], [0, 1, 0]]))
@@ -245,6 +245,7 @@ REFUSED_FILES: list[tuple[str, str, str]] = [
     ("mask", "-", "--click"),
     ("pose", "pose_nan.json", "nan is not within"),
     ("pose", "pose_mirror.json", "rotation"),
+    ("pose", "pose_wide.json", "rotation"),
     ("pose", "pose_rows.json", "four"),
     *((name, "fifo.png", "not a file") for name in ("color", "depth", "mask")),
     ("depth", "zero.png", "not a file"),
@@ -261,6 +262,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("--reach", "900", "metres"),
     ("--depth-scale", "0", "--depth-scale"),
     ("--gravity", "0,0,0", "--gravity"),
+    ("--gravity", "0,1", "--gravity"),
     ("--gravity", "0,nan,1", "--gravity"),
     ("--gravity", "0,-9.8,0", "sign"),
     ("--click", "10,10", "is given for a frame with a mask"),
