@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -27,29 +28,33 @@ from tests.made_runs import make_run, write
 from tests.other_user import NOBODY, needs_root
 
 POLICY = RetryPolicy(max_quarantined_share=0.2, backoff_s=0.01)
+Script = dict[int, tuple[str, ...]]
 
 
-def play(run: Run, folder: Path, words: dict[int, tuple[str, ...]], stop: StopRequest) -> JobSummary:
-    """Drive the run's missing shards: what the script lets pass writes and commits random rows."""
-    notes = folder / "notes"
-    notes.mkdir(exist_ok=True)
-
-    def commit_after(task: ScriptedTask, meter: Meter) -> AttemptResult:
-        run.ledger.start(task.attempt, task.shard)
-        product = perform(task, meter)
-        commit = write(run, task.shard, task.attempt).model_copy(update={"cost": product.cost})
-        return AttemptResult(run.commit(commit), commit.samples, commit.positives, product.cost)
+def play(
+    run: Run, task: Callable[[ScriptedTask, Meter], AttemptResult], stop: StopRequest, script: Script
+) -> JobSummary:
+    """Drive the run's missing shards in this process."""
 
     def make_task(order: AttemptOrder) -> ScriptedTask:
-        return ScriptedTask(order.shard, order.attempt, 60, str(notes), words.get(order.shard, ()))
+        return ScriptedTask(order.shard, order.attempt, 60, "", script.get(order.shard, ()))
 
-    executor = InProcessExecutor(commit_after)
+    executor = InProcessExecutor(task)
     return drive(run.missing(), make_task, executor, RunRecorder(run), POLICY, Heard(), stop)
 
 
 def test_a_job_on_a_real_run_leaves_commits_ledger_and_quarantine(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", shards=())
-    summary = play(run, tmp_path, {1: ("raise",), 3: ("raise",) * 3, 2: ("memory",)}, StopRequest())
+
+    def commit_after(task: ScriptedTask, meter: Meter) -> AttemptResult:
+        """What the script lets pass writes and commits random rows."""
+        run.ledger.start(task.attempt, task.shard)
+        product = perform(task, meter)
+        commit = write(run, task.shard, task.attempt).model_copy(update={"cost": product.cost})
+        return AttemptResult(run.commit(commit), commit.samples, commit.positives, product.cost)
+
+    script: Script = {1: ("raise",), 3: ("raise",) * 3, 2: ("memory",)}
+    summary = play(run, commit_after, StopRequest(), script)
     assert run.committed() == {0, 1, 2, 4} and run.quarantined() == {3} and run.missing() == []
     record = run.quarantine_records()[0]
     assert record.first_scene == 6 and record.scenes == 2 and len(record.stacks) == 3
@@ -76,15 +81,7 @@ def test_the_second_interrupt_breaks_into_the_running_shard(tmp_path: Path) -> N
     run = make_run(tmp_path / "run", shards=())
     before = signal.getsignal(signal.SIGINT)
     with stop_on_signals(StopRequest(), interrupt=True) as stop:
-        summary = drive(
-            run.missing(),
-            lambda o: ScriptedTask(o.shard, o.attempt, 60, ""),
-            InProcessExecutor(interrupt_itself),
-            RunRecorder(run),
-            POLICY,
-            Heard(),
-            stop,
-        )
+        summary = play(run, interrupt_itself, stop, {})
     assert summary.end == "interrupted" and summary.totals.outcomes == {"committed": 1, "cancelled": 2}
     assert signal.getsignal(signal.SIGINT) is before
 

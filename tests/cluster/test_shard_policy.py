@@ -20,7 +20,6 @@ from datagen.cluster.shard_policy import (
     nothing_runs,
     percentile_95,
     too_many_quarantined,
-    window,
 )
 from datagen.schemas.run_records import Outcome
 
@@ -86,13 +85,17 @@ def test_losses_in_a_row_are_the_executors_fault_and_never_before_a_lone_shards_
         decision = decide(POLICY, trouble, AttemptReport("a", 0, "lost"), alone=bool(actions))
         trouble, actions = decision.trouble, [*actions, decision.action]
     assert actions == ["retry"] * 10 + ["quarantine"]
-
-
-def test_after_two_rounds_of_losses_shards_are_tried_one_at_a_time() -> None:
+    # After two rounds of losses shards are tried one at a time, early enough that one which takes the others
+    # along can be told before the job is ended.
     assert [at_once(lost, width=4) for lost in (0, 7, 8, 100)] == [4, 4, 1, 1]
     assert at_once(100, width=1) == 1
-    # Early enough that a shard which takes the others along can be told before the job is ended.
     assert all(not nothing_runs(POLICY, 2 * width, width) for width in range(1, 100))
+
+
+def test_shares_of_quarantined_shards_and_of_few_that_end_a_job_early() -> None:
+    assert not too_many_quarantined(POLICY, 0, 0) and not too_many_quarantined(POLICY, 30, 3000)
+    assert too_many_quarantined(POLICY, 31, 3000) and too_many_quarantined(POLICY, 1, 10)
+    assert not ends_early(POLICY, 19, 100) and ends_early(POLICY, 20, 100)
 
 
 def test_deadlines_follow_what_attempts_took() -> None:
@@ -113,10 +116,3 @@ def test_the_percentile_is_a_value_that_95_in_100_do_not_exceed(values: list[flo
     assert p in values
     assert sum(v <= p for v in values) >= 0.95 * len(values)
     assert sum(v < p for v in values) < 0.95 * len(values)
-
-
-def test_window_and_shares() -> None:
-    assert [window(POLICY, slots) for slots in (0, 1, 2, 64)] == [1, 2, 4, 128]
-    assert not too_many_quarantined(POLICY, 0, 0) and not too_many_quarantined(POLICY, 30, 3000)
-    assert too_many_quarantined(POLICY, 31, 3000) and too_many_quarantined(POLICY, 1, 10)
-    assert not ends_early(POLICY, 19, 100) and ends_early(POLICY, 20, 100)

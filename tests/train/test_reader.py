@@ -14,7 +14,6 @@ import pytest
 from datagen.reports.agreement import read_labels
 from datagen.schemas import shard_reading
 from datagen.schemas.errors import InputError
-from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.shard_reading import read_scene
@@ -157,9 +156,13 @@ def test_merged_shards_may_differ_in_descriptions_but_not_in_types(tmp_path: Pat
         SampleReader([tmp_path])
 
 
-def swap_equal_sizes(run: Run) -> set[str]:
-    """Exchange the chunks of equal size, and other bytes, of the first two shards; their columns."""
-    swapped: set[str] = set()
+@pytest.mark.parametrize("remote", [False, True])
+def test_chunks_that_were_swapped_between_shards_are_refused_by_every_reader(
+    tmp_path: Path, remote: bool, request: pytest.FixtureRequest
+):
+    """Each has the right size, and a crc32c of its own that is right."""
+    place = f"{request.getfixturevalue('bucket')}/run" if remote else str(tmp_path)
+    run, swapped = make_run(place, n=20), set[str]()
     ours, theirs = "shards/000000/a-0", "shards/000001/a-1"
     for file in run.storage.list(ours):
         path = file.key.removeprefix(f"{ours}/")
@@ -168,17 +171,6 @@ def swap_equal_sizes(run: Run) -> set[str]:
             run.storage.put(f"{ours}/{path}", other)
             run.storage.put(f"{theirs}/{path}", one)
             swapped.add(path.partition("/")[0])
-    return swapped
-
-
-@pytest.mark.parametrize("remote", [False, True])
-def test_chunks_that_were_swapped_between_shards_are_refused_by_every_reader(
-    tmp_path: Path, remote: bool, request: pytest.FixtureRequest
-):
-    """Each has the right size, and a crc32c of its own that is right."""
-    place = f"{request.getfixturevalue('bucket')}/run" if remote else str(tmp_path)
-    run = make_run(place, n=20)
-    swapped = swap_equal_sizes(run)
     assert {"distance_m", "visibility"} <= swapped
     for name in swapped & {*ALL, *SAMPLES}:
         scenes, samples = ((name,), ()) if name in ALL else ((), (name,))

@@ -95,20 +95,17 @@ def test_the_box_around_the_middle_counts() -> None:
     assert Detections(np.zeros((0, 4)), np.zeros(0)).best_at_middle((48, 64)) == 0
 
 
-def test_views_show_the_target_in_the_middle_the_right_way_up() -> None:
-    red, green, blue = np.eye(3, dtype=np.uint8) * 255
+def test_views_show_the_target_in_the_middle_the_right_way_up_and_near_points_before_far_ones() -> None:
+    red, green, blue = rgb = np.eye(3, dtype=np.uint8) * 255
+    eye = np.array([[1, 0, 0]], np.float32)
+    points = np.array([[0.3, 0, 0], [0, 0, 0], [2, 0, 0]], np.float32)  # the last is behind the eye
+    for order in ([0, 1, 2], [1, 0, 2]):
+        (view,) = render_views(points[order], rgb[order], eye, 64)
+        assert np.array_equal(view[32, 32], red) and not (view == blue).all(2).any()
     points = np.array([[0, 0, 0], [0, 0, 0.2], [0, 0.2, 0]], np.float32)
-    (view,) = render_views(points, np.stack([red, green, blue]), np.array([[1, 0, 0]], np.float32), 64)
+    (view,) = render_views(points, rgb, eye, 64)
     assert np.array_equal(view[32, 32], red)
     above, beside = (np.argwhere((view == c).all(2)).mean(0) for c in (green, blue))
     assert above[0] < 28 and abs(above[1] - 32) < 2
     assert beside[1] > 36 and abs(beside[0] - 32) < 2  # from +x, +y is to the right
     assert np.array_equal(view[0, 0], [127] * 3)
-
-
-def test_near_points_cover_far_ones_in_views() -> None:
-    points = np.array([[0.3, 0, 0], [0, 0, 0], [2, 0, 0]], np.float32)  # the last is behind the eye
-    rgb = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
-    for order in ([0, 1, 2], [1, 0, 2]):
-        (view,) = render_views(points[order], rgb[order], np.array([[1, 0, 0]], np.float32), 64)
-        assert np.array_equal(view[32, 32], [255, 0, 0]) and not (view == [0, 0, 255]).all(2).any()

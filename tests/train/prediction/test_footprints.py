@@ -11,7 +11,7 @@ from datagen.train.prediction.footprints import Footprint, circle_footprint, pol
 LONG = ((0.2, 0.1), (-0.6, 0.1), (-0.6, -0.1), (0.2, -0.1))
 
 
-def test_a_polygon_holds_points_of_its_own_frame() -> None:
+def test_a_polygon_holds_points_of_its_own_frame_and_turns_with_the_base() -> None:
     base = polygon_footprint(LONG)
     points = np.array([[0.19, 0.0], [-0.59, 0.09], [0.21, 0.0], [0.0, 0.11]])
     assert base.holds(points).tolist() == [True, True, False, False]
@@ -19,17 +19,10 @@ def test_a_polygon_holds_points_of_its_own_frame() -> None:
     assert base.radius_m == pytest.approx(np.hypot(0.6, 0.1))
     assert base.turning_radius_m == pytest.approx(np.hypot(0.4, 0.1))
     assert base.width_m == pytest.approx(0.1)
-
-
-def test_an_outline_turns_with_the_base() -> None:
-    turned = polygon_footprint(LONG).outline(np.array([1.0, 2.0]), np.pi / 2)
+    turned = base.outline(np.array([1.0, 2.0]), np.pi / 2)
     np.testing.assert_allclose(turned[1], [1 - 0.1, 2 - 0.6], atol=1e-12)
-
-
-def test_a_notch_is_outside() -> None:
-    notched = polygon_footprint(
-        [(0.3, 0.3), (-0.3, 0.3), (-0.3, -0.3), (0.3, -0.3), (0.3, -0.1), (0.1, 0.0), (0.3, 0.1)]
-    )
+    corners = [(0.3, 0.3), (-0.3, 0.3), (-0.3, -0.3), (0.3, -0.3), (0.3, -0.1), (0.1, 0.0), (0.3, 0.1)]
+    notched = polygon_footprint(corners)
     assert notched.holds(np.array([[0.25, 0.0], [0.25, 0.2], [-0.2, 0.0]])).tolist() == [False, True, True]
 
 
