@@ -101,20 +101,16 @@ def test_encodings_are_made_once_and_again_for_other_tokens_or_samples(tmp_path:
     make_stream_run(tmp_path / "run", 36)
     make_stream_run(tmp_path / "other", 36, seed=1)
     first = encoded(tmp_path / "run", tmp_path / "e")
-    changed = (tmp_path / "e" / first.key / "tokens.f16").stat().st_mtime_ns
+    tokens = tmp_path / "e" / first.key / "tokens.f16"
+    changed = tokens.stat().st_mtime_ns
     assert encoded(tmp_path / "run", tmp_path / "e", width=8).key == first.key
-    assert (tmp_path / "e" / first.key / "tokens.f16").stat().st_mtime_ns == changed
+    assert tokens.stat().st_mtime_ns == changed
     others = {encoded(tmp_path / "run", tmp_path / "e", tokens=(4, 4, 4)).key}
     others.add(encoded(tmp_path / "other", tmp_path / "e").key)
     assert len(others | {first.key}) == 3
     assert sorted(p.name for p in (tmp_path / "e").iterdir()) == sorted(others | {first.key})
-
-
-@pytest.mark.parametrize("file", ["tokens.f16", "columns.npz"])
-def test_a_damaged_encoding_is_named(file: str, tmp_path: Path):
-    make_stream_run(tmp_path / "run", 36)
-    key = encoded(tmp_path / "run", tmp_path / "e").key
-    place = tmp_path / "e" / key
-    (place / file).write_bytes((place / file).read_bytes()[:100])
-    with pytest.raises(InputError, match=rf"{key}.*is damaged.*Remove this folder"):
-        open_encoded(place)
+    for key, file in zip(others, ("tokens.f16", "columns.npz"), strict=True):  # one that is damaged is named
+        place = tmp_path / "e" / key
+        (place / file).write_bytes((place / file).read_bytes()[:100])
+        with pytest.raises(InputError, match=rf"{key}.*is damaged.*Remove this folder"):
+            open_encoded(place)

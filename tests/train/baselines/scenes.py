@@ -9,8 +9,6 @@ import numpy as np
 
 from datagen.train.inputs import Batch, CandidateInputs, Clouds, RobotInputs
 
-PER_CANDIDATE = ("base_is_clear",)
-
 
 def make_batch(seed: int = 0, n_scenes: int = 3, per_robot: int = 20, points: int = 96) -> Batch[Any]:
     """Scenes with two robots each; labels follow the distance over the reach."""
@@ -60,7 +58,7 @@ def take(batch: Batch[Any], rows: np.ndarray) -> Batch[Any]:
         candidates=CandidateInputs(c.robot_row[rows], c.base_xy_m[rows]),
         label=batch.label[rows],
         sample_id=batch.sample_id[rows],
-        extra={**batch.extra, **{name: batch.extra[name][rows] for name in PER_CANDIDATE}},
+        extra={**batch.extra, "base_is_clear": batch.extra["base_is_clear"][rows]},
     )
 
 

@@ -30,11 +30,10 @@ def box(seen_from: float = 0.0) -> F32:
     return turned(points * HALF_M, seen_from)
 
 
-def table(hole_m: float = 0.0) -> F32:
+def table() -> F32:
     """Points (M, 3) of the surface that the box stands on."""
     x, y = np.meshgrid(np.arange(-0.3, 0.3, 0.008), np.arange(-0.3, 0.3, 0.008))
-    keep = np.maximum(np.abs(x), np.abs(y)) > hole_m
-    return np.stack([x[keep], y[keep], np.full(keep.sum(), -HALF_M[2])], axis=1).astype(np.float32)
+    return np.stack([x, y, np.full(x.shape, -HALF_M[2])], axis=2).reshape(-1, 3).astype(np.float32)
 
 
 def turned(points: F64 | F32, angle: float) -> F32:

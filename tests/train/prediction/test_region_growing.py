@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from datagen.schemas.errors import InputError
-from datagen.train.prediction.frames import RgbdImage
+from datagen.train.prediction.frames import Pinhole, RgbdImage
+from datagen.train.prediction.ground import level_pose
 from datagen.train.prediction.region_growing import grow_mask
 from tests.train.prediction.seen_scenes import Seen, sensor_frame
 
@@ -57,9 +58,6 @@ def test_a_click_on_the_target_grows_to_its_mask(noise: bool, seen: Seen) -> Non
 
 def test_a_wall_and_a_table_are_named() -> None:
     """A picture of a wall ahead and of a table below, of flat depth."""
-    from datagen.train.prediction.frames import Pinhole
-    from datagen.train.prediction.ground import level_pose
-
     pinhole = Pinhole(300.0, 300.0, 159.5, 119.5)
     down = (np.indices((240, 320))[0] - 119.5) / 300
     T = level_pose(np.array([0.0, -1.0, 0.0]), 1.2)
