@@ -38,11 +38,8 @@ def test_a_run_or_sources_that_cannot_be_opened_end_the_job(tmp_path: Path) -> N
 @pytest.fixture(scope="module")
 def spec() -> Specification:
     """Two clutter objects and few points on the built-in world: small, but the whole path."""
-    houses, objects = open_houses("builtin"), open_objects("builtin")
-    sources = {
-        "houses": Source(kind=houses.kind, digest=houses.digest),
-        "objects": Source(kind=objects.kind, digest=objects.digest),
-    }
+    opened = {"houses": open_houses("builtin"), "objects": open_objects("builtin")}
+    sources = {name: Source(kind=source.kind, digest=source.digest) for name, source in opened.items()}
     few = CandidateParams(per_scene=5)
     return small_spec(n_points=256, candidates=few).model_copy(update=sources)
 

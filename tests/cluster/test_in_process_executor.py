@@ -35,9 +35,11 @@ def play(
     run: Run, task: Callable[[ScriptedTask, Meter], AttemptResult], stop: StopRequest, script: Script
 ) -> JobSummary:
     """Drive the run's missing shards in this process."""
+    notes = Path(run.storage.url).with_name("notes")
+    notes.mkdir()
 
     def make_task(order: AttemptOrder) -> ScriptedTask:
-        return ScriptedTask(order.shard, order.attempt, 60, "", script.get(order.shard, ()))
+        return ScriptedTask(order.shard, order.attempt, 60, str(notes), script.get(order.shard, ()))
 
     executor = InProcessExecutor(task)
     return drive(run.missing(), make_task, executor, RunRecorder(run), POLICY, Heard(), stop)
@@ -97,12 +99,9 @@ def test_the_guard_reports_and_leaves_nothing_behind(tmp_path: Path) -> None:
 
     report = guarded(look, ScriptedTask(7, "a", 60, str(notes)), deadline=False)
     assert report.ends_job and report.outcome == "failed" and report.cause == "RUN: the disk is full"
-    assert (
-        isinstance(seen[0], Note)
-        and seen[0].host is not None
-        and seen[0].host.pid == os.getpid()
-        and list(notes.iterdir()) == []
-    )
+    (note,) = seen
+    assert isinstance(note, Note) and note.host is not None and note.host.pid == os.getpid()
+    assert list(notes.iterdir()) == []
     gone = failure_report(ScriptedTask(7, "b", 60, str(notes)), "lost", "node gone")
     assert (gone.outcome, gone.cause, gone.cost, gone.started) == ("lost", "node gone", None, "")
     text = "ImportError: no module\n" + "a long story\n" * 100

@@ -163,20 +163,16 @@ def test_the_floor_in_the_picture_serves_as_well_as_a_pose(
     assert found.grounds[0].residual_m is not None and found.grounds[0].residual_m < 0.02
 
 
-def test_a_frame_fused_with_itself_gives_the_same_scores(
+def test_a_frame_fused_with_itself_gives_the_same_scores_and_a_second_one_shows_more(
     seen: Seen, scorer: ModelScorer, sampling: float
 ) -> None:
     one, twice = of(scorer, sensor_frame(seen)), of(scorer, sensor_frame(seen), sensor_frame(seen))
     assert len(twice.seen.points_m) < len(one.seen.points_m)
     assert np.linalg.norm(twice.center_m - one.center_m) < 0.005
     assert off(twice.score, one.score) < 2 * sampling
-
-
-def test_a_second_frame_shows_more(seen: Seen, scorer: ModelScorer) -> None:
     centre, eye = seen.scene.target_center_m, seen.camera.T_world_camera[:3, 3]
     across = np.array([-(eye - centre)[1], (eye - centre)[0], 0.6])
     other = seen.turned_to(centre + across)
-    one = of(scorer, sensor_frame(seen))
     both = of(scorer, sensor_frame(seen), sensor_frame(other, mask=False))
     assert both.crop_seen > one.crop_seen
     assert np.linalg.norm(both.center_m - centre) < 0.015

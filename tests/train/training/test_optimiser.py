@@ -57,13 +57,8 @@ def test_optimiser_state_is_restored_or_refused():
     put_optimiser_tensors(other, tensors, "c.ckpt")
     assert equal(optimiser_tensors(other), tensors)
     first = "0.exp_avg"
-    bad = [
-        {**tensors, first: torch.zeros(1)},
-        {**tensors, "0.more": torch.zeros(1)},
-        {**tensors, "9999.exp_avg": torch.zeros(1)},
-        {**tensors, "x": torch.zeros(1)},
-        {name: value for name, value in tensors.items() if name != first},
-    ]
+    bad = [{**tensors, name: torch.zeros(1)} for name in (first, "0.more", "9999.exp_avg", "x")]
+    bad.append({name: value for name, value in tensors.items() if name != first})
     for some in bad:
         with pytest.raises(InputError) as error:
             put_optimiser_tensors(other, some, "c.ckpt")
