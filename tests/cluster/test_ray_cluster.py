@@ -20,14 +20,11 @@ from datagen.cluster.ray_settings import head_arguments, head_environment, new_t
 from datagen.schemas.errors import InputError
 from tests.other_user import as_another_user, needs_root, traces_of
 
-LOOPBACK = {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
-SOURCES = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
-
 
 @pytest.fixture(autouse=True)
 def without_token(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
-    for name in SOURCES:
+    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
         monkeypatch.delenv(name, raising=False)
 
 
@@ -51,7 +48,7 @@ def test_a_local_cluster_listens_on_loopback_alone_and_asks_for_its_token(
             for socket in p.net_connections("tcp")
             if socket.status == psutil.CONN_LISTEN
         }
-        assert listening and listening <= LOOPBACK
+        assert listening and listening <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
         address = ray.get_runtime_context().gcs_address
         with pytest.raises(InputError, match=r"requires a token, but none is set\. Set RAY_AUTH_TOKEN"):
             refuse_unusable(address)
