@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.protocol import AttemptReport, JobTotals, StopRequest
+from datagen.cluster.protocol import AttemptReport, JobSummary, JobTotals, StopRequest
 from datagen.cluster.shard_policy import RetryPolicy, ShardFailures
 from datagen.schemas.run_records import Commit, ShardRanges
 from tests.cluster.simulated import FakeClock, Heard, PaperRecorder, commit_by, report_of
@@ -196,7 +196,7 @@ class Silent(Heard):
 
 def simulate(
     shards: int, seed: int, nodes: int = 16, on_tick: Callable[[JobTotals], None] = lambda totals: None
-) -> BadCluster:
+) -> tuple[JobSummary, BadCluster]:
     """Drive the shards to their end and check the result against the cluster's own count."""
     clock = FakeClock()
     cluster = BadCluster(clock, shards, seed, nodes)
@@ -216,4 +216,4 @@ def simulate(
     assert totals.committed + totals.superseded + totals.elsewhere == int(done.sum())
     for said, counted in ((totals.useful_wall_s, cluster.useful_s), (totals.wasted_wall_s, cluster.wasted_s)):
         assert abs(said - counted) <= 1e-9 * counted + 1e-6
-    return cluster
+    return summary, cluster

@@ -209,7 +209,7 @@ def test_twenty_thousand_shards_on_a_bad_cluster() -> None:
 
     tracemalloc.start()
     try:
-        cluster = simulate(20_000, seed=7, on_tick=on_tick)
+        _, cluster = simulate(20_000, seed=7, on_tick=on_tick)
     finally:
         tracemalloc.stop()
     assert {"committed", "crashed", "failed", "hung", "lost", "out_of_memory"} <= set(cluster.outcomes)
