@@ -22,15 +22,13 @@ from datagen.configuration.stored_scenes import StoredScenes, specify_again
 from datagen.display.progress import Progress
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import sample_ids
-from datagen.schemas.record_files import (
-    shard_folder,
-    utc_now,
-)
+from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Commit, FileEntry, ShardRanges, StageClock
+from datagen.schemas.run_records import Commit, ShardRanges, StageClock
 from datagen.schemas.sealing import seal
-from datagen.schemas.shard_files import encode_array, group_metadata
-from datagen.schemas.shard_reading import read_committed
+from datagen.schemas.shard_files import encode_array, group_metadata, zipped
+from datagen.schemas.shard_reading import committed_place
+from datagen.schemas.shard_sources import ZipFiles
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import Storage
 from datagen.workers.labels import distance_visibility_score as formula
@@ -121,7 +119,7 @@ def _open_target(storage: Storage, source: Run, spec: Specification) -> Run:
 def _relabel_shards(
     run: Run, source: Run, missing: Sequence[int], stop: StopRequest, flips: Flips, shown: Progress
 ) -> JobSummary:
-    """Relabel the shards of one run in this process; files are linked, not computed."""
+    """Relabel the shards of one run in this process."""
 
     def work(task: RelabelTask, meter: Meter) -> AttemptResult:
         return relabel_shard(run, source, task, meter, flips)
@@ -154,7 +152,7 @@ class RelabelTask:
 def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips: Flips) -> AttemptResult:
     """Label a committed shard of `source` by the rule of `run`, and commit it there.
 
-    Labels, scores and ids are written, all other files are linked. Raises InputError for a damaged file,
+    Labels, scores and ids are new, all other arrays are the source's. Raises InputError for a damaged file,
     JobCannotContinue for a full or read-only disk.
     """
     clock = StageClock()
@@ -162,14 +160,15 @@ def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips:
         run.ledger.start(task.attempt, task.shard)
     with clock.stage("draw"):
         before = source.commit_of(task.shard)
-        source.check_files(before)
-        stored = read_committed(source.storage, before, _READ)
+        place = committed_place(source, before)
+        stored = place.read(place.metadata(_READ).values())
+        kept = ZipFiles(place.url, source.read_object(before))
     with clock.stage("visibility"):
         made = _relabelled(run, stored)
-        files = _made_files(run, made)
+        files = {path: kept.get(path) for path in kept.paths} | _made_files(run, made)
     with ends_job(), clock.stage("write"):
-        entries, written_bytes = _write(run, source, before, task.attempt, files)
-    cost = meter.cost(clock, written_bytes).model_copy(update={"source_s": before.cost.all_s})
+        entry = run.write_object(task.attempt, zipped(files))
+    cost = meter.cost(clock, entry.size).model_copy(update={"source_s": before.cost.all_s})
     positives = int(made["label"].sum())
     commit = Commit(
         shard=task.shard,
@@ -179,7 +178,7 @@ def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips:
         samples=before.samples,
         positives=positives,
         redraws={},  # nothing was sampled
-        files=entries,
+        object=entry,
         cost=cost,
         host=this_host(),
         created=utc_now(),
@@ -222,27 +221,3 @@ def _made_files(run: Run, made: Columns) -> dict[str, bytes]:
         if column.name in made:
             files |= encode_array(schema, layout, "sample", column, made[column.name])
     return files
-
-
-def _write(
-    run: Run, source: Run, before: Commit, attempt: str, files: dict[str, bytes]
-) -> tuple[tuple[FileEntry, ...], int]:
-    """Write the new files and link the others; return the commit's entries and the bytes written."""
-    old, new = shard_folder(before.shard, before.attempt), shard_folder(before.shard, attempt)
-    entries: list[FileEntry] = []
-    kept: list[tuple[str, str]] = []
-    fresh: dict[str, bytes] = {}
-    for entry in before.files:
-        data = files.get(entry.path)
-        made = entry if data is None else FileEntry.of(entry.path, data)
-        entries.append(made)
-        if data is not None and made != entry:
-            fresh[f"{new}/{entry.path}"] = data
-        else:
-            kept.append((f"{old}/{entry.path}", f"{new}/{entry.path}"))
-    largest = max((entry.size for entry in before.files), default=0)
-    with run.nothing_left_behind(before.shard, attempt):
-        run.storage.adopt_many(source.storage, kept, largest)
-        run.storage.put_many(fresh)
-        run.storage.sync(f"{new}/{entry.path}" for entry in entries)
-    return tuple(entries), sum(map(len, fresh.values()))

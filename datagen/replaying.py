@@ -15,7 +15,7 @@ from datagen.console.options import AS_FOUND, Sources
 from datagen.schemas.checking.finding import Finding
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import Field
-from datagen.schemas.record_files import shard_folder
+from datagen.schemas.record_files import object_key
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_scenes
 from datagen.workers.run_shard import run_shard
@@ -116,8 +116,8 @@ def _replay(run: Run, scene: int, world: World, source: Run) -> Iterator[Finding
             fix = (
                 f"Replay it where it was made, or with a tolerance of your own: this machine differs ({here})"
             )
-        folder = shard_folder(shard, run.commit_of(shard).attempt)
-        yield Finding(folder, "replay", f"scene {scene}: {'; '.join(differences)}", fix, shard)
+        key = object_key(run.commit_of(shard).attempt)
+        yield Finding(key, "replay", f"scene {scene}: {'; '.join(differences)}", fix, shard)
 
 
 def _difference(field: Field, stored: Array, made: Array) -> str:

@@ -35,11 +35,10 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
     stored = None if scenes_run is None else list(read_scenes(scenes_run, task.scene_indices))
     made = run_shard(task.spec, world, task.scene_indices, stored)
     with ends_job(), made.clock.stage("write"):
-        files = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
-        with run.nothing_left_behind(task.shard, task.attempt):
-            entries = run.write_shard(task.shard, task.attempt, files)
+        data = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
+        entry = run.write_object(task.attempt, data)
     labels = made.sample["label"]
-    cost = meter.cost(made.clock, written_bytes=sum(entry.size for entry in entries))
+    cost = meter.cost(made.clock, written_bytes=entry.size)
     positives = int(labels.sum())
     commit = Commit(
         shard=task.shard,
@@ -49,7 +48,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
         samples=len(labels),
         positives=positives,
         redraws=made.redraws,
-        files=entries,
+        object=entry,
         cost=cost,
         host=this_host(),
         created=utc_now(),

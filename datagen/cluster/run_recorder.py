@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datagen.cluster.shard_policy import ShardFailures
-from datagen.schemas.record_files import commit_key, end_from_commit, lost_end, utc_now
+from datagen.schemas.record_files import commit_key, lost_end, utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, LedgerEntry, QuarantineRecord, ShardRanges
 
@@ -15,8 +15,9 @@ class RunRecorder:
         self._run = run
 
     def close(self, entry: LedgerEntry) -> None:
-        """Record how an attempt ended. An earlier record is kept, unless it was a guess."""
-        self._run.ledger.end(entry)
+        """Record how an attempt ended, unless its commit does. An earlier record is kept if not a guess."""
+        if entry.outcome != "committed":
+            self._run.ledger.end(entry)
 
     def quarantine(self, shard: int, trouble: ShardFailures) -> None:
         scenes = self._run.layout.scenes_per_shard
@@ -43,19 +44,14 @@ class RunRecorder:
 def close_lost_attempts(run: Run) -> int:
     """Write end records for attempts of killed drivers; return their number.
 
-    Call it when a job has ended. The worker of a killed driver may outlive
-    it and still commit, so an attempt is closed only once its shard is decided: the committed one with the
-    commit's cost, others as lost with unknown cost. If the driver is still running, its own record replaces
-    this one. Attempts of open shards stay open for the job that resumes.
+    Call it when a job has ended. The worker of a killed driver may outlive it and still commit, so an
+    attempt is closed, as lost with unknown cost, only once its shard is decided without it. If the driver is
+    still running, its own record replaces this one. Attempts of open shards stay open for the job that
+    resumes.
     """
-    recorder, quarantined, closed = RunRecorder(run), run.quarantined(), 0
-    for start in run.ledger.unfinished():
-        commit = recorder.commit_of(start.shard)
-        if commit is None and start.shard not in quarantined:
-            continue
-        if commit is not None and commit.attempt == start.attempt:
-            recorder.close(end_from_commit(commit, start.started))
-        else:
-            recorder.close(lost_end(start, utc_now()))
-        closed += 1
-    return closed
+    committed = {commit.attempt: commit.shard for commit in run.commits()}
+    decided = set(committed.values()) | run.quarantined()
+    lost = [start for start in run.ledger.unfinished(committed) if start.shard in decided]
+    for start in lost:
+        run.ledger.end(lost_end(start, utc_now()))
+    return len(lost)

@@ -13,15 +13,12 @@ from datagen.console.options import AsJson, PathOrAddress
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.display.progress import steps
 from datagen.reports.spending import account_for
-from datagen.schemas.lineage import lineage_summary
-from datagen.schemas.merging import MergePlan, MergeResult, merge_runs, plan_merge
-from datagen.schemas.merging.writing import WrittenUnion
+from datagen.schemas.merging import MergePlan, MergeResult, WrittenPart, merge_runs, plan_merge
 from datagen.schemas.run import Run, label_counts, open_runs
 
 _WORDS = {
     "there_before": "merged before",
-    "linked": "linked",
-    "cut": "resharded",
+    "copied": "copied",
     "held_more_than_once": "duplicates",
 }
 
@@ -53,16 +50,9 @@ def print_merged(report: dict[str, Any], json: bool, **_: Any) -> int:
             [
                 ("labels", f"{part['labels']:,} of {part['n']:,}"),
                 ("shards", ", ".join(counts) or "none"),
-                *(("from", _origin(origin)) for origin in part["lineage"]),
             ],
         )
     return 0
-
-
-def _origin(origin: dict[str, Any]) -> str:
-    return (
-        f"{origin['address']}: {origin['shards']} shards, made on {origin['platform']}, {origin['created']}"
-    )
 
 
 @prints(print_merged)
@@ -76,8 +66,8 @@ def merge(
     """Merge runs into one: from several machines, seeds or houses; partial, overlapping or merged ones too.
 
     Runs may differ in seed, split, houses, objects and --scenes-from; other differences are refused, as are
-    runs with different rows for the same scene. Files are linked, not copied, where shards have the same
-    size. The merged runs stay unchanged. After an interruption, run the same command again.
+    runs with different rows for the same scene. Shards are copied. The merged runs stay unchanged. After an
+    interruption, run the same command again.
 
     For example: datagen merge runs/a runs/b --out runs/all
 
@@ -124,7 +114,7 @@ def merge_report(planned: MergePlan, result: MergeResult) -> dict[str, Any]:
     }
 
 
-def _part(run: Run, written: WrittenUnion | None) -> dict[str, Any]:
+def _part(run: Run, written: WrittenPart | None) -> dict[str, Any]:
     spec, counts = run.manifest.spec, label_counts([run])
     return {
         "run": run.storage.url,
@@ -137,10 +127,8 @@ def _part(run: Run, written: WrittenUnion | None) -> dict[str, Any]:
         "missing_shards": counts.missing,
         "shards": {
             "there_before": written.there if written else len(run.committed()),
-            "linked": written.linked if written else 0,
-            "cut": written.cut if written else 0,
+            "copied": written.copied if written else 0,
             "held_more_than_once": written.spare if written else 0,
         },
-        "attempts": written.attempts if written else len(run.ledger.attempts()),
-        "lineage": lineage_summary(run),
+        "attempts": len(run.ledger.attempts()),
     }

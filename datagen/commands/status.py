@@ -97,8 +97,6 @@ def _print(name: str, storage: Storage, report: dict[str, Any]) -> None:
         for part in report.get("parts", ())
     ]
     print_rows("parts", parts, ("part", "labels", "shards", "quarantined"))
-    lineage = [(source["address"], str(source["shards"]), source["created"]) for source in report["lineage"]]
-    print_rows("merged from", lineage, ("run", "shards", "created"))
     _print_failures(name, report)
 
 
@@ -116,9 +114,8 @@ def _print_failures(name: str, report: dict[str, Any]) -> None:
 
 def _seal(report: dict[str, Any]) -> str:
     if report["sealed"]:
-        return "yes, data.zarr"
+        return f"yes, {report['store']}"
     if report["sealed_labels"] is None:
         return "no"
-    return (
-        f"data.zarr is out of date ({report['sealed_labels']:,} labels): `datagen verify --repair` seals it"
-    )
+    outdated = f"{report['store']} is out of date ({report['sealed_labels']:,} labels)"
+    return f"{outdated}: `datagen verify --repair` seals it"

@@ -122,7 +122,6 @@ def _report(
         "run": run,
         "clean": not found.damage,
         "shards": checked.shards,
-        "files": checked.files,
         "bytes": checked.bytes,
         "samples": checked.samples,
         "sealed": checked.is_sealed,
@@ -152,9 +151,9 @@ def _report(
 def _print(report: dict[str, Any], checked: Checked, found: _Found, repaired: Repaired | None) -> None:
     totals = checked.totals
     wall_s = totals.committed_wall_s + totals.wasted_wall_s
-    files, attempts = counted(checked.files, "file"), counted(totals.attempts, "attempt")
+    attempts = counted(totals.attempts, "attempt")
     rows = [
-        ("shards", f"{checked.shards:,}, {files} of {size(checked.bytes)}, every byte"),
+        ("shards", f"{checked.shards:,}, {size(checked.bytes)}, every byte"),
         ("samples", f"{checked.samples:,}, with correct ids"),
         (
             "ledger",

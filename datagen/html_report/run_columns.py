@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
+from datagen.schemas.run_records import ShardRanges
 from datagen.schemas.shard_reading import read_committed
 
 Array = npt.NDArray[Any]
@@ -63,15 +64,15 @@ class RunColumns:
 
 def read_columns(run: Run) -> RunColumns | None:
     """The columns of all committed shards, or of 256 evenly spaced ones; None without any."""
-    committed = [k for k in sorted(run.committed()) if k < run.layout.shards_for(run.n)]
+    n = run.n
+    committed = run.planned(n).within(ShardRanges.of(run.committed()))
     chosen = np.unique(np.linspace(0, len(committed) - 1, min(MOST_SHARDS, len(committed))).astype(int))
     has_outcome = any(field.name == "outcome" for field in run.schema.sample_fields)
     names = (*_SAMPLE, "outcome") if has_outcome else _SAMPLE
     read: list[dict[str, Array]] = []
     for k in chosen.tolist():
-        scenes, samples = run.layout.rows_wanted(committed[k], run.n)
-        arrays = read_committed(run.storage, run.commit_of(committed[k]), (*_SCENE, *names))
-        read.append({name: arrays[name][: samples if name in names else scenes] for name in arrays})
+        rows = run.rows_of(committed[k], n)
+        read.append(read_committed(run, run.commit_of(committed[k]), (*_SCENE, *names), rows))
     if not read:
         return None
     joined = {name: np.concatenate([shard[name] for shard in read]) for name in read[0]}

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.outcomes import OUTCOMES
-from datagen.schemas.run import Run
+from datagen.schemas.run import MOST_SAMPLES, Run
 from datagen.schemas.shard_reading import read_committed
 from datagen.schemas.specification import Specification
 from datagen.train.bootstrap import Estimate
@@ -49,7 +49,11 @@ def read_labels(run: Run) -> Labels:
     """Read the labels of a run. InputError for a damaged file."""
     has_outcome = any(field.name == "outcome" for field in run.schema.sample_fields)
     names = [*_COLUMNS, *(["outcome"] if has_outcome else [])]
-    shards = [read_committed(run.storage, run.commit_of(shard), names) for shard in sorted(run.committed())]
+    shards = [
+        read_committed(run, commit, names, rows)
+        for commit in run.commits()
+        if (rows := run.rows_of(commit.shard, MOST_SAMPLES)).scenes
+    ]
 
     def joined(name: str) -> Any:
         return np.concatenate([np.zeros(0, np.uint8), *(shard[name] for shard in shards)])

@@ -27,20 +27,18 @@ _SCENE_STAGES = ("draw", "settle", "observe")
 def audit_runs(runs: Sequence[Run]) -> dict[str, Any]:
     """Return the audit of runs by label source, in ascending fidelity; times in core seconds, sizes in bytes.
 
-    `is_exact` is False where a ledger does not add up to commits and waste. InputError for a damaged record
-    or shard.
+    `is_exact` is False where an attempt has a commit and an end in the ledger. InputError for a damaged
+    record or shard.
     """
     labels = [read_labels(run) for run in sorted(runs, key=lambda run: fidelity(run.manifest.spec))]
     by_source: dict[str, list[Labels]] = {}
     for each in labels:
         by_source.setdefault(each.run.manifest.spec.label_source, []).append(each)
     spent = {source: account_for(each.run for each in group) for source, group in by_source.items()}
-    differences = {clock: fsum(s.difference_s[clock] for s in spent.values()) for clock in ("wall", "cpu")}
     contradictions = sum(spending.contradictions for spending in spent.values())
     return {
-        "is_exact": not contradictions and not any(differences.values()),
+        "is_exact": not contradictions,
         "contradictions": contradictions,
-        "difference_s": differences,
         "sources": [
             _source(source, group, spent[source], _scenes_s(group, runs))
             for source, group in by_source.items()
@@ -68,7 +66,7 @@ def _source(
     counts = {
         "label": spending.labels,
         "label_within_reach": near,
-        "positive": spending.positives,
+        "positive": sum(int(each.label.sum()) for each in labels),
         "positive_within_reach": near_positive,
         "scene": spending.scenes,
     }

@@ -23,8 +23,8 @@ def print_audit(report: Mapping[str, Any]) -> None:
     """Print what was made, its cost, the waste, and the cost of the paper's number of labels."""
     if not report["is_exact"]:
         print_lines(
-            f"the ledger does not add up: {counted(report['contradictions'], 'record')} and"
-            f" {report['difference_s']['wall']:.3g} s differ; `datagen verify RUN` names the records"
+            f"the ledger does not add up: {counted(report['contradictions'], 'record')} of committed"
+            " attempts; `datagen verify RUN` names them"
         )
     sources: Sequence[Source] = report["sources"]
     title = "; ".join(dict.fromkeys(source["made_from"] for source in sources))

@@ -64,7 +64,8 @@ def _attempt_events(run: Run, part: str) -> list[Event]:
     bad = [end for end in ends.values() if end.outcome not in _GOOD]
     shards, ended = {end.shard for end in bad}, {end.attempt for end in bad}
     attempts = {end.attempt: end.shard for end in ends.values()}
-    attempts |= {start.attempt: start.shard for start in run.ledger.unfinished()}
+    committed = {commit.attempt for commit in run.commits()}
+    attempts |= {start.attempt: start.shard for start in run.ledger.unfinished(committed)}
     for attempt in sorted(attempt for attempt, shard in attempts.items() if shard in shards):
         start = run.ledger.start_of(attempt)
         if start is not None and start.started:  # else no worker began it, or the time is unknown

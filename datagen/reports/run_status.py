@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from datagen.schemas.lineage import lineage_summary
 from datagen.schemas.quarantine import lifted_records
 from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import ShardRanges
-from datagen.schemas.sealing import SealedPart, SealedRoot, sealed_root
+from datagen.schemas.sealing import StoreRecord, store_record
 from datagen.schemas.storage import Storage
 
 _SHOWN = 20  # causes and stacks
@@ -17,37 +16,35 @@ _SHOWN = 20  # causes and stacks
 
 def runs_report(storage: Storage, stacks: bool = False) -> dict[str, Any]:
     """Return the status of a run, or of merged runs: their sums, and each under `parts`."""
-    runs, root = open_runs(storage), sealed_root(storage)
-    reports = [status_report(run, root, stacks) for run in runs]
+    runs, store = open_runs(storage), store_record(storage)
+    reports = [status_report(run, store, stacks) for run in runs]
     return reports[0] if len(reports) == 1 else _sum(storage, reports)
 
 
-def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False) -> dict[str, Any]:
-    """Return the status of a run. `root` describes the store that holds it, by default its own."""
-    # The ledger before the commits: every attempt that it calls committed then has its commit.
-    ends, begun, n = list(run.ledger.ends()), run.ledger.unfinished(), run.n
-    planned, committed = ShardRanges.of(range(run.layout.shards_for(n))), ShardRanges.of(run.committed())
+def status_report(run: Run, store: StoreRecord | None = None, stacks: bool = False) -> dict[str, Any]:
+    """Return the status of a run. `store` is the one that holds it, by default its own."""
+    n = run.n
+    planned, committed = run.planned(n), ShardRanges.of(run.committed())
     quarantine = run.quarantine_records()
     quarantined = [record.shard for record in quarantine]
     labels = labels_made = positives = 0
     winners: set[str] = set()
     for commit in run.commits():
-        labels += run.layout.rows_wanted(commit.shard, n)[1]
+        labels += run.rows_of(commit.shard, n).samples
         labels_made += commit.samples
         positives += commit.positives
         winners.add(commit.attempt)
-    outcomes: Counter[str] = Counter()
+    outcomes: Counter[str] = Counter({"committed": len(winners)} if winners else {})
     causes: Counter[str] = Counter()
     examples: dict[str, str] = {}  # an attempt of each cause
-    for entry in ends:
+    for entry in run.ledger.ends():
         outcomes[entry.outcome] += 1
         if entry.cause:
             cause = f"{entry.outcome}: {entry.cause}"
             causes[cause] += 1
             examples.setdefault(cause, entry.attempt)
-    unfinished = {start.attempt for start in begun} - winners
-    root = root or sealed_root(run.storage)
-    absent, part = planned.without(committed), root.part(run.manifest.spec_hash) if root else None
+    store = store or store_record(run.storage)
+    absent, part = planned.without(committed), store.part_of(run) if store else None
     common = dict(causes.most_common(_SHOWN))
     report: dict[str, Any] = {
         "run": run.storage.url,
@@ -56,7 +53,7 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
         "made_from": run.manifest.made_from,
         "scenes_from": run.manifest.sources.get("scenes_from"),
         "created": run.manifest.created,
-        "n": n,
+        "n": run.samples_wanted(n),
         "labels": labels,
         # Commits count whole shards, hence more than n where the last one is cut.
         "labels_made": labels_made,
@@ -68,7 +65,7 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
             "missing": len(absent.without(ShardRanges.of(quarantined))),
         },
         "attempts": dict(sorted(outcomes.items())),
-        "attempts_without_end": len(unfinished),
+        "attempts_without_end": len(run.ledger.unfinished(winners)),
         "causes": common,
         "quarantine": [
             {
@@ -79,21 +76,16 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
             for record in quarantine
         ],
         "taken_out_of_quarantine": len(lifted_records(run)),
-        "lineage": lineage_summary(run),
+        "store": store.name if store else None,
         # A store of a shorter run or of fewer shards does not count.
-        "sealed": part is not None and part.n == n and absent == part.missing_shards,
-        "sealed_labels": _sealed_labels(run, part) if part else None,
+        "sealed": part is not None and part.n == n and absent.ranges == part.missing,
+        "sealed_labels": part.samples if part else None,
         "complete": not absent,
     }
     if stacks:
         ends = {cause: run.ledger.end_of(examples[cause]) for cause in common}
         report["stacks"] = {cause: end.stack for cause, end in ends.items() if end is not None and end.stack}
     return report
-
-
-def _sealed_labels(run: Run, part: SealedPart) -> int:
-    """Rows of a run in a store that lacks some of its shards."""
-    return part.n - sum(run.layout.rows_wanted(shard, part.n)[1] for shard in part.missing_shards)
 
 
 def _sum(storage: Storage, parts: list[dict[str, Any]]) -> dict[str, Any]:
@@ -106,7 +98,7 @@ def _sum(storage: Storage, parts: list[dict[str, Any]]) -> dict[str, Any]:
         "created": min(part["created"] for part in parts),
         "complete": all(part["complete"] for part in parts),
         "sealed": all(part["sealed"] for part in parts),
-        "lineage": [],
+        "store": parts[0]["store"],
     }
     for key in ("n", "labels", "labels_made", "positives", "attempts_without_end", "taken_out_of_quarantine"):
         total[key] = sum(part[key] for part in parts)

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from math import fsum
 
-from datagen.schemas.run import Run
+from datagen.schemas.run import MOST_SAMPLES, Run
 from datagen.schemas.run_records import Cost
 
 QUARANTINED = "quarantined"
@@ -45,7 +45,6 @@ class Spending:
     """The cost of a set of runs: each attempt of the ledgers is either committed or waste."""
 
     labels: int = 0
-    positives: int = 0
     scenes: int = 0
     rejected: Counter[str] = field(default_factory=Counter)  # tries of scenes, by cause
     useful: Account = field(default_factory=Account)
@@ -53,8 +52,6 @@ class Spending:
     waste: dict[str, Account] = field(default_factory=dict)
     causes: dict[str, Account] = field(default_factory=dict)  # failed attempts by their cause
     machines: Counter[str] = field(default_factory=Counter)  # attempts by processor
-    # Ledger minus commits minus waste; exactly 0 where every record agrees with its commit.
-    difference_s: dict[str, float] = field(default_factory=lambda: {"wall": 0.0, "cpu": 0.0})
     contradictions: int = 0  # records of the ledger that do not fit the commits
 
     @property
@@ -69,40 +66,26 @@ class Spending:
 
 
 def account_for(runs: Iterable[Run]) -> Spending:
-    """Add up commits and ledgers. A committed attempt is counted once, from its commit.
-
-    The other entries of the ledger are waste by their outcome: ledger = commits + waste.
-    """
+    """Add up commits and ledgers: each attempt has a commit, or an end in the ledger, which is waste."""
     spending = Spending()
     for run in runs:
-        # The ledger before the commits: then an attempt that it calls committed has its commit.
-        ends = {end.attempt: end for end in run.ledger.ends()}
-        committed, shards, quarantined = set[str](), set[int](), run.quarantined()
-        balance = [(1, end.cost) for end in ends.values()]  # each cost once with each sign
+        committed, quarantined = set[str](), run.quarantined()
         for commit in run.commits():
             committed.add(commit.attempt)
-            shards.add(commit.shard)
-            spending.labels += commit.samples
-            spending.positives += commit.positives
-            spending.scenes += commit.scenes
             spending.rejected.update(commit.redraws)
-            spending.useful.add(commit.cost)
             spending.machines[f"{commit.host.cpu}, {commit.host.cores} cores"] += 1
-            end = ends.get(commit.attempt)
-            if end is None and (end := run.ledger.end_of(commit.attempt)):  # written since
-                balance.append((1, end.cost))
-            balance.append((-1, commit.cost))
-            found = None if end is None else (end.shard, end.outcome, end.cost)
-            spending.contradictions += found != (commit.shard, "committed", commit.cost)
-        for end in ends.values():
+            rows = run.rows_of(commit.shard, MOST_SAMPLES)
+            if not rows.scenes:  # another part of these merged runs has its scenes
+                spending.waste.setdefault("superseded", Account()).add(commit.cost)
+                continue
+            spending.labels += rows.samples
+            spending.scenes += rows.scenes
+            spending.useful.add(commit.cost)
+        for end in run.ledger.ends():
+            spending.contradictions += end.outcome == "committed" or end.attempt in committed
             if end.attempt not in committed:
                 kind = QUARANTINED if end.shard in quarantined else end.outcome
                 spending.waste.setdefault(kind, Account()).add(end.cost)
                 if end.cause:
                     spending.causes.setdefault(end.cause, Account()).add(end.cost)
-                balance.append((-1, end.cost))
-                spending.contradictions += end.outcome == "committed" and end.shard not in shards
-        known = [(sign, cost) for sign, cost in balance if cost]
-        spending.difference_s["wall"] += fsum(sign * cost.wall_s for sign, cost in known)
-        spending.difference_s["cpu"] += fsum(sign * cost.cpu_s for sign, cost in known)
     return spending

@@ -10,7 +10,7 @@ import json
 import platform
 import re
 import secrets
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from hashlib import sha256
 from typing import Any, TypeVar
@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.run_records import FORMAT_VERSION, AttemptStart, Commit, LedgerEntry, Manifest
+from datagen.schemas.run_records import FORMAT_VERSION, AttemptStart, LedgerEntry, Manifest
 from datagen.schemas.storage import Storage
 from datagen.schemas.storage.errors import NotARegularFile
 
@@ -36,9 +36,9 @@ _TRAILER_BYTES = len(b',\n "sha256": ""\n}\n') + 64
 Record = TypeVar("Record", bound=BaseModel)
 
 
-def shard_folder(shard: int, attempt: str) -> str:
-    """Key of the folder of one attempt of a shard."""
-    return f"shards/{shard:06d}/{attempt}"
+def object_key(attempt: str) -> str:
+    """Key of the rows that an attempt made."""
+    return f"shards/{attempt}.zip"
 
 
 def commit_key(shard: int) -> str:
@@ -46,14 +46,9 @@ def commit_key(shard: int) -> str:
     return f"commits/{shard:06d}.json"
 
 
-def commit_copy_key(shard: int, attempt: str) -> str:
-    """Key of the copy of a commit record in its attempt's folder."""
-    return f"{shard_folder(shard, attempt)}/commit.json"
-
-
-def part_folder(spec_hash: str) -> str:
-    """Folder of the part with this specification in merged runs."""
-    return f"parts/{spec_hash[:16]}"
+def part_folder(spec_hash: str, scenes_per_shard: int) -> str:
+    """Folder of the part with this specification and these shards in merged runs."""
+    return f"parts/{spec_hash[:16]}-{scenes_per_shard}"
 
 
 def utc_now() -> str:
@@ -174,11 +169,14 @@ def refuse_other(place: str, stored: Manifest, given: Manifest) -> None:
 
 
 MAX_STACK_CHARS = 20_000
-LOST_CAUSE = "it left no end record, and its shard was decided without it"
+LOST_CAUSE = "it left no record, and its shard was decided without it"
 
 
 class Ledger:
-    """Two records per attempt, its start and its end, under `ledger/` of a run's storage."""
+    """The start of every attempt, and the end of those that did not commit, under `ledger/` of a run.
+
+    A commit is the end of its attempt: it has outcome, cost and machine.
+    """
 
     def __init__(self, storage: Storage) -> None:
         self._storage = storage
@@ -193,14 +191,12 @@ class Ledger:
             raise InputError(place, "", "exists already", "Give every attempt its own name")
 
     def end(self, entry: LedgerEntry) -> bool:
-        """Record how an attempt ended; False when its end was recorded before. Long stacks are cut.
+        """Record how an attempt ended without a commit; False when that was recorded. Long stacks are cut.
 
         The end of an attempt that another job recorded as lost replaces that guess. Where the start record is
         missing, it is written here, so that every end has one.
         """
-        if entry.outcome not in ("committed", "superseded") and not self._storage.exists(
-            start_key(entry.attempt)
-        ):
+        if entry.outcome != "superseded" and not self._storage.exists(start_key(entry.attempt)):
             self._storage.put_new(start_key(entry.attempt), encode_record(start_from_end(entry)))
         kept = entry.model_copy(
             update={"stack": entry.stack[-MAX_STACK_CHARS:], "cause": entry.cause[:MAX_STACK_CHARS]}
@@ -229,11 +225,11 @@ class Ledger:
         names = sorted(name for name in self._names() if not name.endswith(".start"))
         return read_records(self._storage, map(end_key, names), LedgerEntry)
 
-    def unfinished(self) -> list[AttemptStart]:
-        """Start records of attempts without an end: running, or lost."""
+    def unfinished(self, committed: Container[str]) -> list[AttemptStart]:
+        """Start records of attempts without an end, and not among the committed: running, or lost."""
         names = self._names()
         began = (name.removesuffix(".start") for name in names if name.endswith(".start"))
-        open_ = sorted(attempt for attempt in began if attempt not in names)
+        open_ = sorted(attempt for attempt in began if attempt not in names and attempt not in committed)
         return list(read_records(self._storage, map(start_key, open_), AttemptStart))
 
     def _names(self) -> set[str]:
@@ -243,19 +239,6 @@ class Ledger:
             for file in self._storage.list("ledger")
             if file.key.endswith(".json")
         }
-
-
-def end_from_commit(commit: Commit, started: str) -> LedgerEntry:
-    """The end record of a committed attempt, with the commit's cost; `started` is "" where unknown."""
-    return LedgerEntry(
-        attempt=commit.attempt,
-        shard=commit.shard,
-        outcome="committed",
-        started=started,
-        ended=commit.created,
-        cost=commit.cost,
-        host=commit.host,
-    )
 
 
 def lost_end(start: AttemptStart, ended: str = "", cause: str = LOST_CAUSE) -> LedgerEntry:

@@ -1,16 +1,17 @@
 """A run on disk: manifest, plans, shards, commits, ledger and quarantine (docs/reference/data-format.md).
 
-Readers, resume, seal and audit trust only commit records: a commit is written last and create-only, so that
-of two racing attempts one wins and the other is waste.
+The rows of an attempt are one immutable object. Readers, resume, seal and audit trust only commit records: a
+commit is written last and create-only, so that of two racing attempts one wins and the other is waste.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
+from typing import NamedTuple
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMA_VERSION, RecordSchema, sized_schema
@@ -20,18 +21,16 @@ from datagen.schemas.record_files import (
     MERGED,
     REPAIR,
     Ledger,
-    commit_copy_key,
     commit_key,
     decode_record,
     encode_record,
-    part_folder,
+    object_key,
     publish,
     read_record,
     read_records,
     refuse_foreign,
     refuse_other,
     refuse_other_format,
-    shard_folder,
     utc_now,
 )
 from datagen.schemas.run_records import (
@@ -47,20 +46,30 @@ from datagen.schemas.run_records import (
     other_value,
 )
 from datagen.schemas.storage import Storage, open_storage
-from datagen.schemas.storage.errors import StoreUnavailable
 
+MOST_SAMPLES = 10**12  # of a run
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
+
+
+class Rows(NamedTuple):
+    """The rows of a shard that count: `scenes` from its scene `first` on, and their samples."""
+
+    first: int
+    scenes: int
+    samples: int
 
 
 class Run:
     """One run. Cheap to open and to send to another process; holds no lock.
 
-    Make it with `Run.create_or_open` or `Run.open`.
+    Make it with `Run.create_or_open` or `Run.open`. `scenes` are those that count in a part of merged runs;
+    None for all that are planned.
     """
 
-    def __init__(self, storage: Storage, manifest: Manifest) -> None:
+    def __init__(self, storage: Storage, manifest: Manifest, scenes: ShardRanges | None = None) -> None:
         self.storage = storage
         self.manifest = manifest
+        self.scenes = scenes
         self.ledger = Ledger(storage)
 
     def __repr__(self) -> str:
@@ -83,14 +92,14 @@ class Run:
         return run
 
     @classmethod
-    def open(cls, path: Storage | Path | str) -> Run:
+    def open(cls, path: Storage | Path | str, scenes: ShardRanges | None = None) -> Run:
         """Open an existing run. InputError where there is none, or it is damaged or of another format."""
         storage = path if isinstance(path, Storage) else open_storage(path, probe=False, create=False)
         manifest = read_record(storage, "manifest.json", Manifest)
         if manifest is None:
             merged = read_record(storage, MERGED, Merged)
             if merged is not None:
-                parts = ", ".join(f"{storage.url}/{part_folder(part)}" for part in merged.parts[:3])
+                parts = ", ".join(f"{storage.url}/{part.folder}" for part in merged.parts[:3])
                 more = f" or another of {len(merged.parts)}" if len(merged.parts) > 3 else ""
                 problem = f"holds {len(merged.parts)} merged runs, but one run is needed"
                 raise InputError(storage.url, "", problem, f"Name one of its parts: {parts}{more}")
@@ -100,7 +109,7 @@ class Run:
         if manifest.spec.hash() != manifest.spec_hash:
             problem = "is not the hash of the specification in the record"
             raise InputError(where, "spec_hash", problem, "The manifest was edited: restore it from a copy")
-        return cls(storage, manifest)
+        return cls(storage, manifest, scenes)
 
     @property
     def layout(self) -> Layout:
@@ -126,7 +135,7 @@ class Run:
 
     def grow(self, n: int, created: str | None = None) -> None:
         """Raise the wanted samples to n; a run never shrinks. `created` is the plan's time [now]."""
-        if not 1 <= n <= 10**12:
+        if not 1 <= n <= MOST_SAMPLES:
             raise InputError("--n", str(n), "is not between 1 and 10^12", "Give the number of samples wanted")
         while True:
             number, wanted = self._newest_plan()
@@ -154,8 +163,36 @@ class Run:
 
     # Shards and commits.
 
-    def planned(self) -> range:
-        return range(self.layout.shards_for(self.n))
+    def planned(self, n: int | None = None) -> ShardRanges:
+        """The shards whose rows count among the first n samples [the wanted ones]."""
+        size, end = self.layout.scenes_per_shard, self.layout.shards_for(self.n if n is None else n)
+        if self.scenes is None:
+            return ShardRanges.of(range(end))
+        spans: list[tuple[int, int]] = []
+        for first, past in self.scenes.ranges:
+            span = (first // size, min(-(-past // size), end))
+            if spans and span[0] <= spans[-1][1]:  # two ranges may share a shard
+                span = (spans.pop()[0], span[1])
+            spans += [span] if span[0] < span[1] else []
+        return ShardRanges.between(spans)
+
+    def samples_wanted(self, n: int) -> int:
+        """Of the first n samples those that count."""
+        if self.scenes is None:
+            return n
+        each = self.layout.candidates_per_scene
+        return sum(min(past * each, n) - min(first * each, n) for first, past in self.scenes.ranges)
+
+    def rows_of(self, shard: int, n: int) -> Rows:
+        """The rows of a shard that count among the first n samples; the last shard may be cut."""
+        size, each = self.layout.scenes_per_shard, self.layout.candidates_per_scene
+        scenes, samples = self.layout.rows_wanted(shard, n)
+        if self.scenes is None:
+            return Rows(0, scenes, samples)
+        start = shard * size
+        spans = ShardRanges.of(range(start, start + scenes)).within(self.scenes).ranges
+        first, past = (spans[0][0] - start, spans[-1][1] - start) if spans else (0, 0)
+        return Rows(first, past - first, min(past * each, samples) - min(first * each, samples))
 
     def committed(self) -> set[int]:
         return self._numbers("commits")
@@ -163,7 +200,7 @@ class Run:
     def missing(self) -> ShardRanges:
         """Planned shards that are neither committed nor quarantined, in order."""
         decided = self._numbers("commits") | self._numbers("quarantine")
-        return ShardRanges.of(self.planned()).without(ShardRanges.of(decided))
+        return self.planned().without(ShardRanges.of(decided))
 
     def commit_of(self, shard: int) -> Commit:
         """The commit record of a committed shard, checked against the manifest."""
@@ -190,57 +227,31 @@ class Run:
             if data is not None:  # else it was removed since the listing
                 yield self.decode_commit(shard, data)
 
-    def write_shard(self, shard: int, attempt: str, files: Mapping[str, bytes]) -> tuple[FileEntry, ...]:
-        """Write an attempt's files durably; return the entries for its commit."""
-        folder = shard_folder(shard, attempt)
-        self.storage.put_many({f"{folder}/{path}": data for path, data in files.items()})
-        self.storage.sync(f"{folder}/{path}" for path in files)
-        return tuple(FileEntry.of(path, data) for path, data in files.items())
-
-    @contextmanager
-    def nothing_left_behind(self, shard: int, attempt: str) -> Generator[None]:
-        """Remove the files that the block wrote for an attempt where the disk fails, to free a full disk.
-
-        Only for attempts whose name no other process can commit.
-        """
-        folder = shard_folder(shard, attempt)
-        try:
-            yield
-        except StoreUnavailable:
-            raise  # deleting would fail too
-        except InputError:
-            with suppress(InputError):
-                self.storage.delete([file.key for file in self.storage.list(folder)])
-                self.storage.remove_empty(folder)
-            raise
+    def write_object(self, attempt: str, data: bytes) -> FileEntry:
+        """Write an attempt's rows durably, and return the entry for its commit."""
+        if not self.storage.put_new(object_key(attempt), data):
+            place = f"{self.storage.url}/{object_key(attempt)}"
+            raise InputError(place, "", "exists already", "Give every attempt its own name")
+        return FileEntry.of(f"{attempt}.zip", data)
 
     def commit(self, commit: Commit) -> bool:
-        """Commit a shard. False where another attempt is committed; the files are then garbage.
+        """Commit a shard. False where another attempt is committed; the rows are then garbage.
 
-        The attempt's folder keeps a copy of the record, from which a damaged one is restored. InputError
-        where a file of the attempt is missing, for example removed by `datagen verify --clean`.
+        InputError where the attempt's rows are missing, for example removed by `datagen verify --clean`.
         """
-        self.check_files(commit)
-        record = encode_record(commit)
-        copy = commit_copy_key(commit.shard, commit.attempt)
-        self.storage.put(copy, record)
-        self.storage.sync([copy])
-        won = self.storage.put_new(commit_key(commit.shard), record)
-        if not won:
-            self.storage.delete([copy])
-        return won
+        if not self.storage.exists(key := object_key(commit.attempt)):
+            place = f"{self.storage.url}/{key}"
+            raise InputError(place, "", "is missing", "Make the shard again with `datagen resume`")
+        return self.storage.put_new(commit_key(commit.shard), encode_record(commit))
 
-    def check_files(self, commit: Commit) -> None:
-        """Raise InputError for a commit whose files are missing or of another size (bytes are not read)."""
-        folder = shard_folder(commit.shard, commit.attempt)
-        sizes = {f.key: f.size for f in self.storage.list(folder)}
-        for entry in commit.files:
-            size = sizes.get(key := f"{folder}/{entry.path}")
-            if size != entry.size:
-                problem = (
-                    "is missing" if size is None else f"has {size} bytes, but {entry.size} were committed"
-                )
-                raise InputError(f"{self.storage.url}/{key}", "", problem, REPAIR)
+    def read_object(self, commit: Commit) -> bytes:
+        """The committed bytes of a shard's rows. InputError where they are missing or have another sha256."""
+        key, entry = object_key(commit.attempt), commit.object
+        data = self.storage.get(key, entry.size)
+        problem = "no such file" if data is None else "has other bytes than were committed"
+        if data is None or len(data) != entry.size or sha256(data).hexdigest() != entry.sha256:
+            raise InputError(f"{self.storage.url}/{key}", "", problem, REPAIR)
+        return data
 
     # Quarantine.
 
@@ -276,9 +287,9 @@ def open_runs(path: Storage | Path | str) -> list[Run]:
     if merged is None:
         return [Run.open(storage)]
     refuse_other_format(f"{storage.url}/{MERGED}", merged.format_version)
-    runs = [Run.open(storage.below(part_folder(spec_hash))) for spec_hash in merged.parts]
-    for run, spec_hash in zip(runs, merged.parts, strict=True):
-        if found := other_value(run.manifest, spec_hash=spec_hash):
+    runs = [Run.open(storage.below(part.folder), ShardRanges.between(part.scenes)) for part in merged.parts]
+    for run, part in zip(runs, merged.parts, strict=True):
+        if found := other_value(run.manifest, spec_hash=part.spec_hash):
             raise InputError(f"{run.storage.url}/manifest.json", *found, REPAIR)
     return runs
 
@@ -297,11 +308,11 @@ def label_counts(runs: Iterable[Run]) -> LabelCounts:
     n = labels = missing = 0
     for run in runs:
         run_n = run.n
-        shards = run.layout.shards_for(run_n)
-        done = [shard for shard in run.committed() if shard < shards]
-        n += run_n
-        labels += sum(run.layout.rows_wanted(shard, run_n)[1] for shard in done)
-        missing += shards - len(done)
+        planned = run.planned(run_n)
+        done = planned.within(ShardRanges.of(run.committed()))
+        n += run.samples_wanted(run_n)
+        labels += sum(run.rows_of(shard, run_n).samples for shard in done)
+        missing += len(planned) - len(done)
     return LabelCounts(n, labels, missing)
 
 
@@ -312,10 +323,11 @@ def find_scene(runs: Sequence[Run], scene: int) -> tuple[Run, int]:
     """
     left = scene
     for run in runs:
-        scenes = -(-run.n // run.layout.candidates_per_scene)
-        if 0 <= left < scenes:
-            return run, left
-        left -= scenes
+        scenes = ShardRanges.of(range(-(-run.n // run.layout.candidates_per_scene)))
+        scenes = scenes if run.scenes is None else scenes.within(run.scenes)
+        if 0 <= left < len(scenes):
+            return run, scenes[left]
+        left -= len(scenes)
     last = scene - left - 1
     problem = f"{scene} is not in this run" if len(runs) == 1 else f"{scene} is in none of these runs"
     raise InputError(runs[0].storage.url, "--scene", problem, f"Give one from 0 to {last}")

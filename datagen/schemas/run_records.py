@@ -23,7 +23,7 @@ from pydantic import (
 
 from datagen.schemas.specification import Specification
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 # A file name without folders, and a path of such names: neither can lead outside the run.
 AttemptName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
@@ -99,15 +99,27 @@ class Plan(StoredRecord):
     number: int = Field(ge=1)
 
 
+_Number = Annotated[int, Field(ge=0, le=10**18)]
+Ranges = tuple[tuple[_Number, _Number], ...]  # first and one past the last of each
+
+
+class MergedPart(StoredRecord):
+    """One of merged runs: the folder that holds it, and its scenes that count."""
+
+    folder: FilePath
+    spec_hash: Digest
+    scenes: Ranges
+
+
 class Merged(StoredRecord):
-    """merged.json: merged runs, each complete below parts/, in the order of their rows."""
+    """merged.json: merged runs, in the order of their rows. No scene counts in two of them."""
 
     format_version: int = FORMAT_VERSION
-    parts: tuple[Digest, ...] = Field(min_length=2)  # specification hashes, ascending
+    parts: tuple[MergedPart, ...] = Field(min_length=2)
 
 
 class FileEntry(StoredRecord):
-    """One file of a committed attempt, relative to the attempt's folder."""
+    """One file: its path below the folder that its record describes, its size and its digest."""
 
     path: FilePath
     size: int = Field(ge=0, le=2**40)
@@ -171,7 +183,7 @@ class Commit(StoredRecord):
     samples: int = Field(ge=0)
     positives: int = Field(ge=0)
     redraws: dict[str, int]
-    files: tuple[FileEntry, ...]
+    object: FileEntry  # the rows, in shards/
     cost: Cost
     host: Host
     created: str
@@ -179,8 +191,11 @@ class Commit(StoredRecord):
 
 def foreign_field(manifest: Manifest, shard: int, commit: Commit) -> tuple[str, str] | None:
     """(field, problem) where a commit cannot belong to this shard of the run; else None."""
-    scenes, samples = manifest.layout.scenes_per_shard, manifest.layout.samples_per_shard
-    return other_value(commit, shard=shard, spec_hash=manifest.spec_hash, scenes=scenes, samples=samples)
+    layout, path = manifest.layout, f"{commit.attempt}.zip"
+    expected = {"shard": shard, "spec_hash": manifest.spec_hash, "scenes": layout.scenes_per_shard}
+    return other_value(commit, **expected, samples=layout.samples_per_shard) or other_value(
+        commit.object, path=path
+    )
 
 
 def other_value(record: StoredRecord, **expected: object) -> tuple[str, str] | None:
@@ -204,7 +219,7 @@ class AttemptStart(StoredRecord):
 
 
 class LedgerEntry(StoredRecord):
-    """ledger/<attempt>.json: outcome and cost of one attempt."""
+    """ledger/<attempt>.json: outcome and cost of an attempt without a commit, which has them of others."""
 
     format_version: int = FORMAT_VERSION
     attempt: AttemptName
@@ -246,6 +261,15 @@ class ShardRanges(Sequence[int]):
         self._ends = np.cumsum(bounds[:, 1] - bounds[:, 0])  # shards up to the end of each range
 
     @classmethod
+    def between(cls, ranges: Iterable[tuple[int, int]]) -> ShardRanges:
+        """The set of ascending, disjoint ranges, each (first, one past the last)."""
+        return cls(np.array(list(ranges), np.int64).reshape(-1, 2))
+
+    @property
+    def ranges(self) -> tuple[tuple[int, int], ...]:
+        return tuple((int(first), int(past)) for first, past in self.bounds)
+
+    @classmethod
     def of(cls, shards: Iterable[int] | Bounds) -> ShardRanges:
         """The set of the given shards, in any order."""
         if isinstance(shards, ShardRanges):
@@ -260,6 +284,14 @@ class ShardRanges(Sequence[int]):
         first = numbers[np.concatenate([[0], breaks + 1])]
         last = numbers[np.concatenate([breaks, [len(numbers) - 1]])]
         return cls(np.stack([first, last + 1], axis=1))
+
+    def union(self, others: ShardRanges) -> ShardRanges:
+        merged: list[tuple[int, int]] = []
+        for first, past in sorted([*self.ranges, *others.ranges]):
+            if merged and first <= merged[-1][1]:
+                first, past = merged[-1][0], max(merged.pop()[1], past)
+            merged.append((first, past))
+        return ShardRanges.between(merged)
 
     def within(self, others: ShardRanges) -> ShardRanges:
         return self.without(self.without(others))

@@ -1,14 +1,16 @@
-"""Encode a shard as files: one immutable, flat Zarr v3 group, made in memory.
+"""Encode a shard as one object: a flat Zarr v3 group in an uncompressed zip, which Zarr's ZipStore opens.
 
 All arrays of both tables are at the group's root; their first dimension is "scene" or "sample". Chunks are
-bytes (or vlen-utf8) -> zstd -> crc32c, every chunk is written, and its key has no folders ("c.0.0"), so
-that a shard has one folder per array. zarr-python makes the metadata once per layout, which takes 3 ms per
-array; chunks are encoded directly. Tests compare the bytes with those that zarr-python writes.
+bytes (or vlen-utf8) -> zstd -> crc32c, every chunk is written, and its key has no folders ("c.0.0").
+zarr-python makes the metadata once per layout, which takes 3 ms per array; chunks are encoded directly. Tests
+compare the bytes with those that zarr-python writes.
 """
 
 from __future__ import annotations
 
+import io
 import json
+import zipfile
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -31,6 +33,7 @@ from datagen.schemas.specification import Specification
 Array = npt.NDArray[Any]
 
 ZSTD_LEVEL = 3
+_FILE_BYTES = {True: 64 * 2**20, False: 8 * 2**20}  # uncompressed, of clouds and of other arrays
 MAX_CHUNK_BYTES = 4 * 2**20  # of uncompressed numbers; keeps random reads of single clouds cheap
 MAX_TEXT_BYTES = 4096  # the longest name
 
@@ -50,6 +53,13 @@ def chunk_rows(schema: RecordSchema, field: Field, rows: int) -> int:
     row_bytes = int(np.prod(schema.shape(field, 1))) * np.dtype(field.dtype).itemsize
     most = max(1, MAX_CHUNK_BYTES // row_bytes)
     return next(c for c in range(min(rows, most), 0, -1) if rows % c == 0)
+
+
+def _chunks_per_file(schema: RecordSchema, field: Field, step: int, rows: int) -> int:
+    """Chunks of `step` rows in each file of a sealed array."""
+    row_bytes = 64 if field.is_text else int(np.prod(schema.shape(field, 1))) * np.dtype(field.dtype).itemsize
+    most = _FILE_BYTES[row_bytes >= 2**10] // (row_bytes * step)
+    return max(1, min(most, -(-rows // step)))
 
 
 def chunk_key(field: Field, index: int) -> str:
@@ -82,8 +92,8 @@ def encode_shard(
     spec_hash: str,
     scene_arrays: Mapping[str, Array],
     sample_arrays: Mapping[str, Array],
-) -> dict[str, bytes]:
-    """Return the files of one full shard, by path within the attempt's folder.
+) -> bytes:
+    """Return the object of one full shard.
 
     `scene_arrays` have `layout.scenes_per_shard` rows, `sample_arrays` `samples_per_shard`, sorted
     by scene. InputError when an array breaks the schema.
@@ -93,7 +103,22 @@ def encode_shard(
         schema.check(table, rows_per_shard(layout, table), arrays)
         for field in schema.table(table):
             files |= encode_array(schema, layout, table, field, arrays[field.name])
-    return files
+    return zipped(files)
+
+
+def zipped(files: Mapping[str, bytes]) -> bytes:
+    """The files in an uncompressed zip; equal files give equal bytes."""
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w", zipfile.ZIP_STORED) as archive:
+        for path, data in files.items():
+            archive.writestr(_entry(path), data)
+    return made.getvalue()
+
+
+def _entry(path: str) -> zipfile.ZipInfo:
+    entry = zipfile.ZipInfo(path, (1980, 1, 1, 0, 0, 0))
+    entry.create_system = 3  # else that of the machine
+    return entry
 
 
 def encode_array(
@@ -141,13 +166,14 @@ def zarr_metadata(
     rows: Mapping[str, int],
     attributes: Mapping[str, Any],
     of_arrays: Mapping[str, Mapping[str, Any]] | None = None,
+    is_sharded: bool = False,
 ) -> dict[str, bytes]:
     """Return the zarr.json files of a group with `rows` per table, chunked like the layout's shards.
 
-    `of_arrays` are further attributes of arrays, by name.
+    `of_arrays` are further attributes of arrays, by name. With `is_sharded`, many chunks share a file.
     """
     files: dict[str, bytes] = {}
-    for path, data in _made_by_zarr(schema, layout).items():
+    for path, data in _made_by_zarr(schema, layout, tuple(rows.items()) if is_sharded else ()).items():
         meta = json.loads(data)
         if path == "zarr.json":
             meta["attributes"] = dict(attributes)
@@ -159,17 +185,23 @@ def zarr_metadata(
 
 
 @lru_cache(maxsize=16)
-def _made_by_zarr(schema: RecordSchema, layout: Layout) -> Mapping[str, bytes]:
-    """Metadata by zarr-python for a group with one shard's rows."""
+def _made_by_zarr(
+    schema: RecordSchema, layout: Layout, sharded: tuple[tuple[str, int], ...] = ()
+) -> Mapping[str, bytes]:
+    """Metadata by zarr-python for a group with one shard's rows, or with these rows per table in files of
+    many chunks."""
     store: dict[str, Any] = {}
     group = zarr.create_group(MemoryStore(store), zarr_format=3, attributes={"": ""})
     for table, field in schema.fields:
         rows = rows_per_shard(layout, table)
+        step = chunk_rows(schema, field, rows)
+        many = _chunks_per_file(schema, field, step, dict(sharded)[table]) if sharded else 0
         codec = VLenUTF8Codec() if field.is_text else BytesCodec(endian="little")
         group.create_array(
             field.name,
             shape=schema.shape(field, rows),
-            chunks=schema.shape(field, chunk_rows(schema, field, rows)),
+            chunks=schema.shape(field, step),
+            shards=schema.shape(field, many * step) if many else None,
             dtype=field.dtype,
             fill_value=fill_value(field),
             serializer=codec,

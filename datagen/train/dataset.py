@@ -270,7 +270,7 @@ class SampleStream:
         shard, scenes = wanted
         place, arrays = self._shards[shard]
         columns, bounds = load_shard(place, arrays)
-        where = f"{place.storage.url}/{place.folder}"
+        where = place.url
         stored = stored_scenes(where, columns, self._dims, bounds, self._scenes.row[scenes])
         return dict(zip(scenes.tolist(), stored, strict=True))
 

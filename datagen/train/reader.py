@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.shard_reading import ShardPlace, StoredArray
+from datagen.schemas.shard_reading import ShardPlace
+from datagen.schemas.stored_arrays import StoredArray
 from datagen.train.inputs import I64, Array
 from datagen.train.run_parts import open_parts
 
@@ -83,7 +84,7 @@ def load_shard(place: ShardPlace, arrays: Mapping[str, StoredArray]) -> tuple[Co
     sizes = np.diff(bounds)
     if bounds[0] or (sizes < 0).any() or not np.array_equal(np.repeat(scenes, sizes), owners):
         raise InputError(
-            f"{place.storage.url}/{place.folder}",
+            place.url,
             "sample_scene_index",
             "has a sample of a scene outside its shard, or in another order",
             "Repair it with `datagen verify --repair`",

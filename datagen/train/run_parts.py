@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from datagen.schemas.errors import InputError, choices
 from datagen.schemas.fields import SCHEMA_VERSION, SCHEMAS
 from datagen.schemas.record_files import MERGED
-from datagen.schemas.run import Run, open_runs
-from datagen.schemas.shard_reading import MAX_META_BYTES, ShardPlace, StoredArray, committed_place
+from datagen.schemas.run import Rows, Run, open_runs
+from datagen.schemas.run_records import Layout
+from datagen.schemas.shard_reading import ShardPlace, committed_place
+from datagen.schemas.shard_sources import StoreFiles
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
+from datagen.schemas.stored_arrays import MAX_META_BYTES, StoredArray, arrays_of
 
 _SEALED_FIX = "Seal the run again, and copy the whole data.zarr"
 
@@ -24,7 +27,8 @@ class RunPart:
     """One run's shards and arrays, or those of a sealed store without its run.
 
     A merged store has several `spec_hashes` and `specs`. `cost` is the sum over commits of wall and CPU
-    seconds, with those of the labels that a run was relabelled from; None for a sealed store.
+    seconds, with those of the labels that a run was relabelled from; None for a sealed store. `merged` is
+    the address of the merged runs that it is a part of: their parts have no scene in common.
     """
 
     place: str
@@ -35,6 +39,7 @@ class RunPart:
     shards: Sequence[ShardPlace]
     arrays: Mapping[str, StoredArray]
     cost: Mapping[str, float] | None
+    merged: str = ""
 
 
 def open_parts(
@@ -59,13 +64,13 @@ def open_parts(
 
 def refuse_twins(parts: Sequence[RunPart]) -> None:
     """Raise InputError where two parts have one specification: their samples would count twice."""
-    seen: dict[str, str] = {}
+    seen: dict[str, RunPart] = {}
     for part in parts:
         for spec_hash in part.spec_hashes:
-            if spec_hash in seen:
-                problem = f"has the specification of {seen[spec_hash]}, so samples would occur twice"
+            first = seen.setdefault(spec_hash, part)
+            if first is not part and not (part.merged and part.merged == first.merged):
+                problem = f"has the specification of {first.place}, so samples would occur twice"
                 raise InputError(part.place, "", problem, "Name it once, or merge them with `datagen merge`")
-            seen[spec_hash] = part.place
 
 
 def _words(array: StoredArray) -> str:
@@ -77,64 +82,45 @@ def _open(path: Path | str, names: Sequence[str], allow_incomplete: bool) -> lis
     if is_sealed_store(path):
         return [open_sealed(path, names)]
     storage = open_storage(path, probe=False, create=False)
-    found = (_open_run(run, names, allow_incomplete) for run in open_runs(storage))
+    runs = open_runs(storage)
+    merged = storage.url if len(runs) > 1 else ""
+    found = (_open_run(run, merged, names, allow_incomplete) for run in runs)
     opened = [part for part in found if part is not None]
     if not opened:
         raise InputError(storage.url, "commits", "no shard is committed", "Make some with `datagen resume`")
     return opened
 
 
-def _open_run(run: Run, names: Sequence[str], allow_incomplete: bool) -> RunPart | None:
-    _ = run.schema  # refuses a version that this program does not know
+def _open_run(run: Run, merged: str, names: Sequence[str], allow_incomplete: bool) -> RunPart | None:
     n, url = run.n, run.storage.url
-    paths = {f"{name}/zarr.json" for name in names}
-    shards: list[ShardPlace] = []
-    arrays: dict[str, StoredArray] = {}
-    first: dict[str, str] = {}
+    stored = arrays_of(run.schema, run.layout)
+    _refuse_unknown(url, names, list(stored))
+    planned, shards = run.planned(n), list[ShardPlace]()
     cost = {"wall_s": 0.0, "cpu_s": 0.0}
     for commit in run.commits():
-        if commit.shard >= run.layout.shards_for(n):
-            continue
-        place = committed_place(run.storage, commit, names, *run.layout.rows_wanted(commit.shard, n))
-        metadata = {entry.path: entry.sha256 for entry in commit.files if entry.path in paths}
-        if not shards:
-            stored = [e.path for e in commit.files if e.path.endswith("/zarr.json")]
-            _refuse_unknown(url, names, [path.removesuffix("/zarr.json") for path in stored])
-            first, arrays = metadata, place.metadata(names)
-        # Merged runs may come from versions that describe an array in other words.
-        elif metadata != first:
-            _refuse_other_arrays(place, arrays)
-        shards.append(place)
-        for kind in ("wall", "cpu"):
-            cost[f"{kind}_s"] += commit.cost.all_s[kind]
-    missing = n - sum(place.samples for place in shards)
+        if commit.shard in planned:
+            shards.append(committed_place(run, commit, run.rows_of(commit.shard, n)))
+            for kind in ("wall", "cpu"):
+                cost[f"{kind}_s"] += commit.cost.all_s[kind]
+    wanted = run.samples_wanted(n)
+    missing = wanted - sum(place.samples for place in shards)
     if missing and not allow_incomplete:
-        problem = f"{missing:,} of the {n:,} planned samples are missing"
+        problem = f"{missing:,} of the {wanted:,} planned samples are missing"
         fix = f"Make them with `datagen resume {url}`, or allow an incomplete run where that is an option"
         raise InputError(url, "commits", problem, fix)
     if not shards:
         return None
     manifest = run.manifest
     version = manifest.schema_version
-    specs = (manifest.spec,)
-    return RunPart(url, (manifest.spec_hash,), specs, manifest.schema_name, version, shards, arrays, cost)
+    specs, arrays = (manifest.spec,), {name: stored[name] for name in names}
+    spec_hashes, schema = (manifest.spec_hash,), manifest.schema_name
+    return RunPart(url, spec_hashes, specs, schema, version, shards, arrays, cost, merged)
 
 
 def _refuse_unknown(url: str, names: Sequence[str], stored: Sequence[str]) -> None:
     for name in names:
         if name not in stored:
             raise InputError(url, name, "is not a field of the run", choices(stored, name))
-
-
-def _refuse_other_arrays(place: ShardPlace, arrays: Mapping[str, StoredArray]) -> None:
-    for name, array in place.metadata(list(arrays)).items():
-        if replace(array, attributes=arrays[name].attributes) != arrays[name]:
-            raise InputError(
-                f"{place.storage.url}/{place.folder}/{name}/zarr.json",
-                name,
-                "differs from the other shards' metadata",
-                "Repair it with `datagen verify --repair`",
-            )
 
 
 def is_sealed_store(path: Path | str) -> bool:
@@ -155,12 +141,12 @@ def open_sealed(path: Path | str, names: Sequence[str]) -> RunPart:
     try:
         meta: dict[str, Any] = json.loads(data)
         attributes = meta["attributes"]
-        per_shard = int(attributes["scenes_per_shard"])
-        per_scene = int(attributes["candidates_per_scene"])
+        per_shard, per_scene = attributes["scenes_per_shard"], attributes["candidates_per_scene"]
+        layout = Layout(scenes_per_shard=per_shard, candidates_per_scene=per_scene)
         stored = list(meta["consolidated_metadata"]["metadata"])
         schema, version = str(attributes["schema"]), int(attributes["schema_version"])
-        runs = attributes.get("parts", [attributes])
-        spec_hashes = tuple(str(part["spec_hash"]) for part in runs)
+        runs = attributes["parts"]
+        spec_hashes = tuple(dict.fromkeys(str(part["spec_hash"]) for part in runs))
         specs = tuple(Specification.model_validate_json(json.dumps(part["specification"])) for part in runs)
     except (ValueError, KeyError, TypeError, RecursionError) as e:
         raise InputError(where, "", f"is not the root of a sealed store ({e})", _SEALED_FIX) from e
@@ -168,22 +154,22 @@ def open_sealed(path: Path | str, names: Sequence[str]) -> RunPart:
         problem = f"is {schema!r} {version}, but this program reads {', '.join(SCHEMAS)} {SCHEMA_VERSION}"
         raise InputError(where, "schema_version", problem, "Use the version of datagen that made the run")
     _refuse_unknown(storage.url, names, stored)
-    arrays = ShardPlace(storage, "", 0, 0, 0, 0, 0).metadata(names)
+    source = StoreFiles(storage)
+    arrays = source.metadata(names)
     scenes = {a.shape[0] for a in arrays.values() if a.dims[0] == "scene"}
     samples = {a.shape[0] for a in arrays.values() if a.dims[0] == "sample"}
-    if len(scenes) != 1 or len(samples) != 1 or per_shard < 1 or per_scene < 1:
+    if len(scenes) != 1 or len(samples) != 1:
         raise InputError(where, "shape", "differs between arrays of one table", _SEALED_FIX)
     n_scenes, n_samples = scenes.pop(), samples.pop()
-    full = per_shard * per_scene
-    if (shards := -(-n_scenes // per_shard)) != -(-n_samples // full):
+    if n_scenes != -(-n_samples // per_scene):
         raise InputError(where, "shape", f"{n_scenes} scenes do not match {n_samples} samples", _SEALED_FIX)
     for array in arrays.values():
-        if (per_shard if array.dims[0] == "scene" else full) % array.chunk_rows:
+        if (per_shard if array.dims[0] == "scene" else layout.samples_per_shard) % array.chunk_rows:
             raise InputError(where, array.name, "chunks that do not divide a shard", _SEALED_FIX)
-    counts = [
-        (min(per_shard, n_scenes - i * per_shard), min(full, n_samples - i * full)) for i in range(shards)
+    slices = [
+        ShardPlace(source, k, Rows(0, *layout.rows_wanted(k, n_samples)), per_shard, layout.samples_per_shard)
+        for k in range(layout.shards_for(n_samples))
     ]
-    slices = [ShardPlace(storage, "", i, *count, per_shard, full) for i, count in enumerate(counts)]
     return RunPart(str(path), spec_hashes, specs, schema, version, slices, arrays, None)
 
 

@@ -77,7 +77,7 @@ def read_scene_table(
                     continue
                 label = columns["label"][first:past]
                 if label.max() > 1:
-                    where, problem = f"{place.storage.url}/{place.folder}", f"a label of {label.max()}"
+                    where, problem = place.url, f"a label of {label.max()}"
                     raise InputError(where, "label", problem, "Repair the run with `datagen verify --repair`")
                 digest.update(columns["sample_id"][first:past].tobytes())
                 digest.update(label.tobytes())

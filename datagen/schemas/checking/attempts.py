@@ -1,33 +1,16 @@
-"""Checks of the records of attempts: commits with their copies, the ledger, and the quarantine."""
+"""Checks of the records of attempts: commits, the ledger, and the quarantine."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from collections.abc import Container, Iterator, Mapping
+from dataclasses import dataclass
+from typing import TypeVar
 
-from pydantic import BaseModel
-
-from datagen.schemas.checking.finding import (
-    BACKUP,
-    AnyRecord,
-    Finding,
-    Kind,
-    Read,
-    Restore,
-    SetAside,
-    compare,
-    curable,
-    read,
-)
-from datagen.schemas.errors import InputError
+from datagen.schemas.checking.finding import BACKUP, Finding, Kind, Restore, SetAside, curable, read
 from datagen.schemas.quarantine import name_before
 from datagen.schemas.record_files import (
-    commit_copy_key,
     commit_key,
-    decode_record,
     encode_record,
-    end_from_commit,
     end_key,
     lost_end,
     start_from_end,
@@ -44,7 +27,6 @@ from datagen.schemas.run_records import (
     foreign_field,
     other_value,
 )
-from datagen.schemas.storage import Storage, StoredFile
 
 Ledgered = TypeVar("Ledgered", AttemptStart, LedgerEntry)
 
@@ -56,83 +38,27 @@ ODD_COST_FIX = "Find out which program wrote it: the record is undamaged"
 
 @dataclass(frozen=True, eq=False)
 class CheckedShard:
-    """A shard that is or was committed, with its commit where one of the two files is undamaged."""
+    """A committed shard, with its commit where that is undamaged."""
 
     shard: int
     commit: Commit | None
     findings: tuple[Finding, ...]
 
 
-def check_commit(run: Run, shard: int, listed: Mapping[str, StoredFile]) -> CheckedShard:
-    """Check the shard's commit and its copy, among the files listed below the shard's folder.
-
-    Without a commit file, a copy counts only where the caller knows that there was a commit.
-    """
-    ours = read(run.storage, commit_key(shard), Commit, lambda c: _foreign_to(run, shard, c))
-    if ours.record is not None:
-        attempt = ours.record.attempt
-        copy = _copy(run, shard, attempt)
-        is_won = copy.data == ours.data or _is_committed_in_ledger(run, shard, attempt)
-        copies = [] if is_won else _sound_copies(run, shard, listed)
-        if not any(c.record and _is_committed_in_ledger(run, shard, c.record.attempt) for c in copies):
-            return CheckedShard(shard, ours.record, tuple(compare(ours, copy, shard)))
-        # The record of a superseded attempt, or of another run of the specification, replaced it.
-        ours = Read(ours.key, ours.data, None, "is not that of the committed attempt")
-    copies = _sound_copies(run, shard, listed)
-    if len(copies) > 1:  # killed superseded attempts left theirs too
-        copies = [c for c in copies if c.record and _is_committed_in_ledger(run, shard, c.record.attempt)]
-    if len(copies) == 1:
-        return CheckedShard(shard, copies[0].record, tuple(compare(ours, copies[0], shard)))
-    if not listed and ours.data is None and ours.problem == "missing":
-        return CheckedShard(shard, None, ())  # there is nothing to commit
-    problem = f"{ours.problem}, and {'there is no copy' if not copies else 'several attempts left copies'}"
-    return CheckedShard(shard, None, (curable(ours.key, "lost", problem, SetAside(run), shard),))
-
-
-def _sound_copies(run: Run, shard: int, listed: Mapping[str, StoredFile]) -> list[Read[Commit]]:
-    """The undamaged copies of commits in the folders of a shard's attempts."""
-    names = [key.split("/") for key in sorted(listed)]
-    copies = (_copy(run, shard, n[2]) for n in names if len(n) == 4 and n[3] == "commit.json")
-    return [copy for copy in copies if copy.record is not None]
-
-
-def _copy(run: Run, shard: int, attempt: str) -> Read[Commit]:
-    def refuse(commit: Commit) -> str:
-        return _foreign_to(run, shard, commit) or "is another attempt's" * (commit.attempt != attempt)
-
-    return read(run.storage, commit_copy_key(shard, attempt), Commit, refuse)
-
-
-def _foreign_to(run: Run, shard: int, commit: Commit) -> str:
-    return ": ".join(foreign_field(run.manifest, shard, commit) or ())
-
-
-def check_account(run: Run, commit: Commit) -> list[Finding]:
-    """Check the start and the end of a committed attempt: both exist, the end has the commit's cost."""
-    shard = commit.shard
-    start = read(run.storage, start_key(commit.attempt), AttemptStart)
-    end = read(run.storage, end_key(commit.attempt), LedgerEntry)
-    findings: list[Finding] = []
-    problem = end.problem
-    if end.record is not None:
-        expected = {"attempt": commit.attempt, "shard": shard, "outcome": "committed", "cost": commit.cost}
-        if found := other_value(end.record, **expected):
-            problem = f"{found[0]}: differs from the attempt's commit"
-        elif end.record.cost is None:
-            problem = "cost: differs from the attempt's commit"
-    if problem:
-        known = end_from_commit(commit, start.record.started if start.record else "")
-        problem = f"{problem}; the commit has it"
-        findings.append(_account_finding(run.storage, end, problem, known, shard))
-    problem = start.problem
-    if start.record is not None and (start.record.attempt, start.record.shard) != (commit.attempt, shard):
-        problem = "belongs to another attempt"
-    if problem:
-        known = start_from_end(end_from_commit(commit, end.record.started if end.record else ""))
-        findings.append(_account_finding(run.storage, start, problem, known, shard))
-    if odd := odd_cost(commit.cost):
-        findings.append(Finding(commit_key(shard), "account", odd, ODD_COST_FIX, shard))
-    return findings
+def check_commit(run: Run, shard: int) -> CheckedShard:
+    """Check the shard's commit; a damaged one is set aside, and the shard made again."""
+    found = read(
+        run.storage,
+        commit_key(shard),
+        Commit,
+        lambda c: ": ".join(foreign_field(run.manifest, shard, c) or ()),
+    )
+    if found.record is None:
+        cure = SetAside(run)
+        return CheckedShard(shard, None, (curable(found.key, "record", found.problem, cure, shard),))
+    odd = odd_cost(found.record.cost)
+    findings = [Finding(found.key, "account", odd, ODD_COST_FIX, shard)] if odd else []
+    return CheckedShard(shard, found.record, tuple(findings))
 
 
 def odd_cost(cost: Cost | None) -> str:
@@ -149,40 +75,19 @@ def odd_cost(cost: Cost | None) -> str:
     return ""
 
 
-def _is_committed_in_ledger(run: Run, shard: int, attempt: str) -> bool:
-    end = read(run.storage, end_key(attempt), LedgerEntry).record
-    return end is not None and (end.outcome, end.attempt, end.shard) == ("committed", attempt, shard)
-
-
-def _account_finding(
-    storage: Storage, found: Read[Any], problem: str, known: BaseModel, shard: int
-) -> Finding:
-    """The finding for a wrong ledger record; not repairable where it is the only copy of another record."""
-    try:
-        other = decode_record("", found.data or b"", AnyRecord).model_extra or {}
-    except InputError:
-        other = {}
-    key_of = end_key if "outcome" in other else start_key
-    home = key_of(str(other.get("attempt"))[:100])
-    if "attempt" in other and home != found.key and read(storage, home, AnyRecord).data != found.data:
-        return Finding(found.key, "account", problem, f"Move it to {home} and restore this file", shard)
-    return curable(found.key, "account", problem, Restore(encode_record(known)), shard)
-
-
 @dataclass
 class LedgerTotals:
-    """Sums of wall seconds in the records: the ledger's must equal commits plus waste."""
+    """Sums of wall seconds in the records."""
 
     committed_wall_s: float = 0.0
     wasted_wall_s: float = 0.0
     attempts: int = 0
     without_account: int = 0
     unfinished: int = 0  # began, not ended, and may still run
-    lost_shards: dict[int, str] = field(default_factory=dict[int, str])  # committed only by the ledger
 
 
-def check_rest(run: Run, committed: Mapping[int, str], totals: LedgerTotals) -> Iterator[Finding]:
-    """Check every ledger record except those of `committed` attempts (shard -> attempt); add to the sums."""
+def check_ledger(run: Run, committed: Mapping[int, str], totals: LedgerTotals) -> Iterator[Finding]:
+    """Check every ledger record, given the `committed` attempts (shard -> attempt); add to the sums."""
     names: set[str] = set()
     for file in run.storage.list("ledger"):
         name = file.key.removeprefix("ledger/")
@@ -190,67 +95,75 @@ def check_rest(run: Run, committed: Mapping[int, str], totals: LedgerTotals) -> 
             names.add(name.removesuffix(".json"))
         elif not name.endswith(".part"):  # left by a killed writer
             yield curable(file.key, "foreign", "is not a record of the ledger", SetAside())
+    shards = {attempt: shard for shard, attempt in committed.items()}
     decided = committed.keys() | run.quarantined()
-    attempts = {name.removesuffix(".start") for name in names} - set(committed.values())
-    for attempt in sorted(attempts):
+    for attempt in sorted({name.removesuffix(".start") for name in names} | shards.keys()):
+        if attempt in shards:
+            yield from _check_start(run, attempt, shards[attempt])
+            if attempt in names:
+                problem = "is the end of an attempt that has a commit"
+                yield curable(end_key(attempt), "account", problem, SetAside(), shards[attempt])
+            continue
+        totals.attempts += 1
         if attempt in names:
-            yield from _check_end(run, attempt, committed, totals)
+            yield from _check_end(run, attempt, totals)
         else:
             yield from _check_unfinished(run, attempt, decided, totals)
-        totals.attempts += 1
 
 
-def _check_end(
-    run: Run, attempt: str, committed: Mapping[int, str], totals: LedgerTotals
-) -> Iterator[Finding]:
-    end, start = _read(run, attempt, end_key, LedgerEntry), _read(run, attempt, start_key, AttemptStart)
+def _check_start(run: Run, attempt: str, shard: int) -> Iterator[Finding]:
+    """The start of a committed attempt, which its commit restores without the time."""
+    start = read(run.storage, start_key(attempt), AttemptStart)
+    problem = start.problem
+    if start.record is not None and (start.record.attempt, start.record.shard) != (attempt, shard):
+        problem = _OF_ANOTHER
+    if problem:
+        known = Restore(encode_record(AttemptStart(attempt=attempt, shard=shard, started="")))
+        yield curable(start.key, "account", problem, known, shard)
+
+
+def _check_end(run: Run, attempt: str, totals: LedgerTotals) -> Iterator[Finding]:
+    end, start = (
+        read(run.storage, end_key(attempt), LedgerEntry, lambda e: _misnamed(e.attempt, attempt)),
+        read(run.storage, start_key(attempt), AttemptStart, lambda s: _misnamed(s.attempt, attempt)),
+    )
     if end.record is None:
-        for one in (end, start):
-            if one.problem:
-                yield _unknown(one)
+        yield _misplaced(end.key, "account", end.problem)
         return
     noted = end.record
     if start.record is None:
-        yield _account_finding(run.storage, start, start.problem, start_from_end(noted), noted.shard)
+        yield curable(
+            start.key, "account", start.problem, Restore(encode_record(start_from_end(noted))), noted.shard
+        )
     if odd := odd_cost(noted.cost):
         yield Finding(end.key, "account", odd, ODD_COST_FIX, noted.shard)
     totals.without_account += noted.cost is None
     totals.wasted_wall_s += noted.cost.wall_s if noted.cost else 0.0
-    if noted.outcome == "committed" and noted.shard not in committed:
-        totals.lost_shards[noted.shard] = attempt
 
 
 def _check_unfinished(
     run: Run, attempt: str, decided: Container[int], totals: LedgerTotals
 ) -> Iterator[Finding]:
-    start = _read(run, attempt, start_key, AttemptStart)
+    key = start_key(attempt)
+    start = read(run.storage, key, AttemptStart, lambda s: _misnamed(s.attempt, attempt))
     if start.record is None:
-        yield _unknown(start)
+        yield _misplaced(key, "account", start.problem)
     elif start.record.shard in decided:
         totals.without_account += 1
         problem = "missing, but its shard is decided; the cost is unknown"
-        cure = Restore(encode_record(lost_end(start.record, utc_now())), is_guess=True)
+        cure = Restore(encode_record(lost_end(start.record, utc_now())))
         yield curable(end_key(attempt), "account", problem, cure, start.record.shard)
     else:
         totals.unfinished += 1
 
 
-def _unknown(one: Read[Any]) -> Finding:
-    """A bad record whose content follows from no other one: set aside, its attempt has no known cost."""
-    if one.data is None:
-        return Finding(one.key, "account", one.problem, BACKUP)
-    return _misplaced(one.key, "account", one.problem)
-
-
 def _misplaced(key: str, kind: Kind, problem: str) -> Finding:
     """A damaged record, which is set aside, or an undamaged one in the place of another, which is not."""
+    if problem == "missing":
+        return Finding(key, kind, problem, BACKUP)
     if problem == _OF_ANOTHER:
         return Finding(key, kind, problem, "Give it back the name of its own attempt or shard")
     return curable(key, kind, problem, SetAside())
-
-
-def _read(run: Run, attempt: str, key_of: Callable[[str], str], model: type[Ledgered]) -> Read[Ledgered]:
-    return read(run.storage, key_of(attempt), model, lambda record: _misnamed(record.attempt, attempt))
 
 
 def check_quarantine(run: Run) -> Iterator[Finding]:

@@ -5,24 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import chain
 
 from datagen.schemas.checking.attempts import (
     CheckedShard,
     LedgerTotals,
-    check_account,
     check_commit,
+    check_ledger,
     check_quarantine,
-    check_rest,
 )
-from datagen.schemas.checking.finding import Finding, below
+from datagen.schemas.checking.finding import Finding, SetAside, below, curable
 from datagen.schemas.checking.roots import check_notes, check_plans, open_roots
-from datagen.schemas.checking.sealed import SealedTally, check_chunks, check_store, read_root, runs_named
-from datagen.schemas.checking.shards import ShardForm, check_shard, form_of
-from datagen.schemas.errors import InputError
+from datagen.schemas.checking.sealed import check_store, read_store
+from datagen.schemas.checking.shards import check_shard
+from datagen.schemas.record_files import object_key
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
-from datagen.schemas.sealing.contents import SealedRun
 from datagen.schemas.storage import Storage, concurrent_map
 
 _THREADS = 4  # hashing and decompression release the GIL
@@ -34,7 +33,6 @@ class Checked:
     """Counts of what was checked, for the report; they grow while findings are consumed."""
 
     shards: int = 0
-    files: int = 0
     bytes: int = 0
     samples: int = 0
     is_sealed: bool = False
@@ -43,8 +41,7 @@ class Checked:
 
     def count(self, commit: Commit) -> None:
         self.shards += 1
-        self.files += len(commit.files)
-        self.bytes += sum(entry.size for entry in commit.files)
+        self.bytes += commit.object.size
         self.samples += commit.samples
         self.totals.attempts += 1
         self.totals.committed_wall_s += commit.cost.wall_s
@@ -61,82 +58,46 @@ def check_runs(
     roots = open_roots(storage)
     yield from roots.findings
     checked.runs = roots.runs
-    wanted: dict[str, int] = {}
+    found = list(roots.findings)
     for run in roots.runs:
-        wanted[run.manifest.spec_hash], found = check_plans(run)
-        yield from below(roots.folder_of(run), chain(found, check_notes(run.storage)))
+        found += below(roots.folder_of(run), chain(check_plans(run), check_notes(run.storage)))
     if roots.is_merged:
-        yield from check_notes(storage)
-    root, found = read_root(storage, roots.runs, wanted)
+        found += check_notes(storage)
     yield from found
-    sealed = runs_named(root, roots.runs) if root else {}
-    tally = SealedTally()
-    checked.is_sealed = root is not None
-    checks = [
-        _RunCheck(storage, run, roots.folder_of(run), form_of(run), sealed.get(run.manifest.spec_hash))
-        for run in roots.runs
-    ]
-    work = [(check, check.shards()) for check in checks]
-    total, done = sum(len(shards) for _, shards in work), 0
+    record, of_store = read_store(storage)
+    yield from of_store
+    checked.is_sealed = record is not None
+    work = [(run, sorted(run.committed())) for run in roots.runs]
+    total, done, is_sound = sum(len(shards) for _, shards in work), 0, not found
     threads = _REMOTE_THREADS if storage.folder is None else _THREADS
     with ThreadPoolExecutor(threads) as pool:
-        for check, shards in work:
-            committed: dict[int, str] = {}
-            for looked in concurrent_map(pool, 2 * threads, check.look_at, shards):
-                yield from looked.findings
-                if check.sealed is not None and looked.shard in check.sealed.shards:
-                    tally.add(check.sealed, looked)
+        for run, shards in work:
+            prefix, committed = roots.folder_of(run), dict[int, str]()
+            for looked in concurrent_map(pool, 2 * threads, partial(_look_at, run), shards):
+                yield from below(prefix, looked.findings)
+                is_sound = is_sound and not looked.findings
                 if looked.commit is not None:
                     committed[looked.shard] = looked.commit.attempt
                     checked.count(looked.commit)
                 done += 1
                 seen(done, total)
-            yield from check.rest(committed, checked)
-    if root is not None:
-        yield from check_store(storage, roots.runs, wanted, sealed, tally)
+            rest = (_check_objects(run), check_ledger(run, committed, checked.totals), check_quarantine(run))
+            yield from below(prefix, chain.from_iterable(rest))
+    if record is not None:
+        yield from check_store(storage, record, roots.runs, is_sound)
 
 
-@dataclass(frozen=True, eq=False)
-class _RunCheck:
-    """Checks of one run, which lies in the folder `prefix` of the checked path."""
+def _look_at(run: Run, shard: int) -> CheckedShard:
+    """Check one shard: commit, object, rows."""
+    found = check_commit(run, shard)
+    if found.commit is None:
+        return found
+    return replace(found, findings=(*found.findings, *check_shard(run, found.commit)))
 
-    storage: Storage
-    run: Run
-    prefix: str
-    form: ShardForm
-    sealed: SealedRun | None  # its part of the store
 
-    def shards(self) -> list[int]:
-        return sorted(self.run.committed().union(self.sealed.shards if self.sealed else ()))
-
-    def look_at(self, shard: int) -> CheckedShard:
-        """Check one shard: commit, ledger entries, files, rows, and chunks in the sealed store."""
-        run, folder = self.run, f"shards/{shard:06d}"
-        try:
-            listed = {file.key: file for file in run.storage.list(folder)}
-        except InputError as error:  # it holds something that is not a file: the shard is not trusted
-            key = error.place.removeprefix(f"{run.storage.url}/")
-            foreign = [Finding(key, "foreign", error.problem, error.fix, shard)]
-            return CheckedShard(shard, None, tuple(below(self.prefix, foreign)))
-        found = check_commit(run, shard, listed)
-        findings, commit = list(found.findings), found.commit
-        if commit is not None:
-            findings += check_account(run, commit)
-            own = {key: f for key, f in listed.items() if key.startswith(f"{folder}/{commit.attempt}/")}
-            findings += check_shard(run, self.form, commit, own)
-        findings = list(below(self.prefix, findings))
-        if commit is not None and self.sealed is not None and shard in self.sealed.shards:
-            findings += check_chunks(self.storage, self.prefix, self.form, self.sealed, commit)
-        return replace(found, findings=tuple(findings))
-
-    def rest(self, committed: dict[int, str], checked: Checked) -> Iterator[Finding]:
-        """Check the rest of the run: the waste in the ledger, lost commits, the quarantine."""
-        totals = checked.totals
-        totals.lost_shards = {}
-        yield from below(self.prefix, check_rest(self.run, committed, totals))
-        for shard in sorted(totals.lost_shards.keys() - set(self.shards())):
-            looked = self.look_at(shard)
-            yield from looked.findings
-            if looked.commit is not None:
-                checked.count(looked.commit)
-        yield from below(self.prefix, check_quarantine(self.run))
+def _check_objects(run: Run) -> Iterator[Finding]:
+    """Other files among the objects; those of attempts that did not commit are garbage, not damage."""
+    for file in run.storage.list("shards"):
+        name = file.key.removeprefix("shards/")
+        if "/" in name or not (name.endswith(".part") or file.key == object_key(name.removesuffix(".zip"))):
+            yield curable(file.key, "foreign", "is not the object of an attempt", SetAside())

@@ -14,9 +14,9 @@ from datagen.schemas.run import Run
 from datagen.schemas.storage import Storage
 
 # record: a JSON record is damaged, missing, or differs from its copy. account: the ledger is inconsistent.
-# file: a committed file is missing or has other bytes. rows: committed rows break the schema. lost: a
-# commit and its copy are missing. foreign: a file that no record names. sealed: data.zarr differs from
-# its shards. replay: a scene made again differs. stale: data.zarr is older than its run.
+# file: a committed object is missing or has other bytes. rows: committed rows break the schema. lost: the
+# commit of a sealed shard is missing. foreign: a file that no record names. sealed: data.zarr has other files
+# than were written. replay: a scene made again differs. stale: data.zarr is older than its run.
 Kind = Literal["record", "account", "file", "rows", "lost", "foreign", "sealed", "replay", "stale"]
 
 BACKUP = "Restore the file from a backup"
@@ -26,13 +26,9 @@ Record = TypeVar("Record", bound=BaseModel)
 
 @dataclass(frozen=True)
 class Restore:
-    """Write these bytes, which come from a second copy or follow from other records.
-
-    `is_guess` where a running process may still write the true record: then only a missing file is written.
-    """
+    """Write these bytes, which come from a second copy or follow from other records."""
 
     data: bytes
-    is_guess: bool = False
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ An interrupted repair is continued by the next one.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from secrets import token_hex
@@ -16,16 +16,18 @@ from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.cleaning import refuse_running
 from datagen.schemas.checking.finding import Finding, Reseal, Restore, SetAside, read
 from datagen.schemas.errors import InputError
-from datagen.schemas.record_files import SET_ASIDE, commit_key, encode_record, end_key
+from datagen.schemas.record_files import SET_ASIDE, commit_key, object_key
 from datagen.schemas.run import Run, label_counts, open_runs
-from datagen.schemas.run_records import LedgerEntry
-from datagen.schemas.sealing import SEALED, seal, unseal
+from datagen.schemas.run_records import Commit, LedgerEntry, ShardRanges
+from datagen.schemas.sealing import remove_store, seal, store_record
+from datagen.schemas.sealing.contents import RECORD, SEALED
 from datagen.schemas.storage import Storage
 
 # Restoring a record reveals what depends on it: commits, then shards, then the sealed store.
 _PASSES = 6
 # Kinds of findings that do not keep a run from being sealed.
 _HARMLESS = ("account", "sealed", "stale")
+_MOST_BYTES = 2**31  # of a file that is set aside
 _CAUSE = "its shard was set aside by datagen verify --repair"
 
 Seen = Callable[[int, int], None]
@@ -67,11 +69,12 @@ def _repair_once(storage: Storage, result: Repaired, refused: dict[str, str]) ->
     restores = [(f.key, f.cure) for f in result.left if isinstance(f.cure, Restore)]
     for key, cure in restores:
         with _noting(refused, key):
-            is_put = storage.put_new(key, cure.data) if cure.is_guess else _put(storage, key, cure.data)
-            result.restored += [key] * is_put
+            storage.put(key, cure.data)
+            storage.sync([key])
+            result.restored.append(key)
     if restores:
         return True
-    aside = {_folder_of(storage, finding): finding for finding in result.left}
+    aside = {_key_of(storage, finding): finding for finding in result.left}
     aside = {key: finding for key, finding in aside.items() if isinstance(finding.cure, SetAside)}
     for key, finding in aside.items():
         with _noting(refused, finding.key):
@@ -88,16 +91,10 @@ def _noting(refused: dict[str, str], key: str) -> Generator[None]:
         refused[key] = f"{error.problem}. {error.fix}"
 
 
-def _put(storage: Storage, key: str, data: bytes) -> bool:
-    storage.put(key, data)
-    storage.sync([key])
-    return True
-
-
-def _folder_of(storage: Storage, finding: Finding) -> str:
-    """Key of the folder of the finding's shard where that is set aside, else of its file."""
-    if isinstance(finding.cure, SetAside) and finding.cure.run is not None:
-        return f"{_prefix(storage, finding.cure.run)}shards/{finding.shard:06d}"
+def _key_of(storage: Storage, finding: Finding) -> str:
+    """Key of the commit of the finding's shard where that is set aside, else of its file."""
+    if isinstance(finding.cure, SetAside) and finding.cure.run is not None and finding.shard is not None:
+        return f"{_prefix(storage, finding.cure.run)}{commit_key(finding.shard)}"
     return finding.key
 
 
@@ -106,29 +103,35 @@ def _prefix(storage: Storage, run: Run) -> str:
 
 
 def _set_aside(storage: Storage, key: str, finding: Finding, into: str) -> None:
-    """Move the files of a shard, commit first, or one file. The shard's attempts become superseded."""
+    """Move the commit and the object of a shard, or one file. The shard's attempt becomes superseded."""
     run = finding.cure.run if isinstance(finding.cure, SetAside) else None
     if run is None or finding.shard is None:
         _move(storage, [key], into)
         return
-    keys = [file.key for file in storage.list(key)]
-    commit = f"{_prefix(storage, run)}{commit_key(finding.shard)}"
-    _move(storage, [commit, *keys] if storage.exists(commit) else keys, into)
-    storage.remove_empty(key)
-    for attempt in sorted({file.removeprefix(f"{key}/").split("/")[0] for file in keys}):
-        end = read(run.storage, end_key(attempt), LedgerEntry).record
-        if end is not None and (end.outcome, end.shard) == ("committed", finding.shard):
-            spare = end.model_copy(update={"outcome": "superseded", "cause": _CAUSE})
-            _put(run.storage, end_key(attempt), encode_record(spare))
+    commit = read(run.storage, commit_key(finding.shard), Commit).record
+    rows = f"{_prefix(storage, run)}{object_key(commit.attempt)}" if commit else ""
+    _move(storage, [key, rows] if rows and storage.exists(rows) else [key], into)
+    if commit is not None:
+        run.ledger.end(
+            LedgerEntry(
+                attempt=commit.attempt,
+                shard=commit.shard,
+                outcome="superseded",
+                cause=_CAUSE,
+                ended=commit.created,
+                cost=commit.cost,
+                host=commit.host,
+            )
+        )
 
 
 def _move(storage: Storage, keys: Iterable[str], into: str) -> None:
-    """Move files into a folder: all exist there, durably, before the first is removed."""
-    pairs = [(key, f"{into}/{key}") for key in keys]
-    storage.adopt_many(storage, pairs)
-    storage.sync(new for _, new in pairs)
-    for key, _ in pairs:
-        storage.delete([key])
+    """Move files into a folder: each exists there, durably, before it is removed."""
+    for key in keys:
+        data = storage.get(key, _MOST_BYTES)
+        if data is not None:
+            storage.put_new(f"{into}/{key}", data)
+            storage.delete([key])
 
 
 def _reseal(storage: Storage, result: Repaired) -> bool:
@@ -143,13 +146,12 @@ def _reseal(storage: Storage, result: Repaired) -> bool:
     if not any(finding.kind not in _HARMLESS for finding in result.left):
         try:
             runs = open_runs(storage)
-            if any(run.committed() - set(run.planned()) for run in runs):
+            if any(ShardRanges.of(run.committed()).without(run.planned()) for run in runs if not run.scenes):
                 why = "More shards are committed than wanted: raise the number with `datagen resume --n`"
             else:
                 result.resealed = True
                 has_labels = label_counts(runs).labels > 0
-                if storage.folder is None or not has_labels:
-                    unseal(storage)  # in an object store, a chunk of the old store may be damaged
+                _forget_store(storage, is_damaged=any(f.kind == "sealed" for f in result.left))
                 if has_labels:
                     seal(storage)
                 return result.checked.is_sealed or has_labels
@@ -161,3 +163,13 @@ def _reseal(storage: Storage, result: Repaired) -> bool:
         outdated = [Finding(SEALED, "sealed", "cannot be made", why)]
     result.left = [*kept, *outdated]
     return False
+
+
+def _forget_store(storage: Storage, is_damaged: bool) -> None:
+    """Remove a store that is damaged: an undamaged one is replaced once the new one is written."""
+    if not is_damaged:
+        return
+    with suppress(InputError):  # its record is damaged
+        if (record := store_record(storage)) is not None:
+            remove_store(storage, record.name)
+    storage.delete([RECORD])

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from datagen.schemas.checking.finding import (
     AnyRecord,
     Finding,
-    Restore,
     SetAside,
     below,
     compare,
@@ -17,10 +16,18 @@ from datagen.schemas.checking.finding import (
     sound,
 )
 from datagen.schemas.errors import InputError
-from datagen.schemas.lineage import LINEAGE, Lineage
-from datagen.schemas.record_files import MERGED, copy_key, encode_record, part_folder, refuse_other_format
+from datagen.schemas.record_files import MERGED, copy_key, refuse_other_format
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import FORMAT_VERSION, Commit, Manifest, Merged, Plan, other_value
+from datagen.schemas.run_records import (
+    FORMAT_VERSION,
+    Commit,
+    Manifest,
+    Merged,
+    MergedPart,
+    Plan,
+    ShardRanges,
+    other_value,
+)
 from datagen.schemas.storage import Storage
 
 _MANIFEST = "manifest.json"
@@ -31,13 +38,14 @@ _BROKEN_OFF = "Merge the runs again: it finishes a merge that was interrupted"
 class Roots:
     """The runs at a path that can be opened, and findings on the records at its root."""
 
+    url: str
     runs: list[Run] = field(default_factory=list[Run])
     is_merged: bool = False
     findings: list[Finding] = field(default_factory=list[Finding])
 
     def folder_of(self, run: Run) -> str:
         """The run's folder relative to the path, with a trailing slash."""
-        return f"{part_folder(run.manifest.spec_hash)}/" if self.is_merged else ""
+        return f"{run.storage.url.removeprefix(self.url)}/".lstrip("/") if self.is_merged else ""
 
 
 def open_roots(storage: Storage) -> Roots:
@@ -50,41 +58,30 @@ def open_roots(storage: Storage) -> Roots:
         run, found = _open_run(storage)
         if run is None and not found:
             raise InputError(storage.url, _MANIFEST, "not a run: no such file", "Name a run's folder")
-        return Roots([run] if run else [], False, found)
-    roots = Roots([], True, findings)
-    for spec_hash in parts:
-        folder = part_folder(spec_hash)
+        return Roots(storage.url, [run] if run else [], False, found)
+    roots = Roots(storage.url, [], True, findings)
+    for part in parts:
         run, found = None, list[Finding]()
-        if next(iter(storage.list(folder)), None) is not None:
-            run, found = _open_run(storage.below(folder), spec_hash)
+        if next(iter(storage.list(part.folder)), None) is not None:
+            run, found = _open_run(storage.below(part.folder), part.spec_hash)
         if run is None and not found:
             found = [Finding(_MANIFEST, "record", "missing, as is its copy", "Merge the runs again")]
-        roots.findings += below(f"{folder}/", found)
+        roots.findings += below(f"{part.folder}/", found)
         if run is not None:
-            roots.runs.append(run)
+            roots.runs.append(Run(run.storage, run.manifest, ShardRanges.between(part.scenes)))
     return roots
 
 
-def _merged_parts(storage: Storage) -> tuple[tuple[str, ...] | None, list[Finding]]:
-    """Specification hashes of the parts, or None where these are not merged runs."""
+def _merged_parts(storage: Storage) -> tuple[tuple[MergedPart, ...] | None, list[Finding]]:
+    """The parts, or None where these are not merged runs."""
     ours, copy = read(storage, MERGED, Merged), read(storage, copy_key(MERGED), Merged)
     merged = sound(ours, copy)
     if merged is not None:
         refuse_other_format(f"{storage.url}/{MERGED}", merged.format_version)
         return merged.parts, compare(ours, copy, fix=_BROKEN_OFF)
-    hashes: set[str] = set()
-    for folder in sorted({"/".join(f.key.split("/")[:2]) for f in storage.list("parts")}):
-        run, _ = _open_run(storage.below(folder)) if folder.count("/") == 1 else (None, [])
-        if run is not None and part_folder(run.manifest.spec_hash) == folder:
-            hashes.add(run.manifest.spec_hash)
-    if ours.data is None and ours.problem == "missing" and len(hashes) < 2:
+    if ours.problem == copy.problem == "missing":
         return None, []
-    if len(hashes) < 2:
-        problem = f"{ours.problem}, and cannot be restored from the parts"
-        return (), [Finding(MERGED, "record", problem, "Merge the runs again")]
-    parts = tuple(sorted(hashes))
-    data = encode_record(Merged(parts=parts))
-    return parts, [curable(MERGED, "record", f"{ours.problem}; the parts restore it", Restore(data))]
+    return (), compare(ours, copy)
 
 
 def _open_run(storage: Storage, spec_hash: str | None = None) -> tuple[Run | None, list[Finding]]:
@@ -116,8 +113,8 @@ def _named(storage: Storage) -> set[str]:
     return {record.spec_hash for record in (*commits, *plans) if record and record.spec_hash}
 
 
-def check_plans(run: Run) -> tuple[int, list[Finding]]:
-    """Return the samples wanted, and findings on plans: each has its copy, and a larger n than the last."""
+def check_plans(run: Run) -> list[Finding]:
+    """Check plans: each has its copy, and a larger n than the last."""
     findings: list[Finding] = []
     numbers = {0}
     for folder in ("plans", copy_key("plans")):
@@ -129,7 +126,7 @@ def check_plans(run: Run) -> tuple[int, list[Finding]]:
     fix = "Restore the file from a backup, or set the number again with `datagen resume RUN --n N`"
     if max(numbers) > 10 * len(numbers) + 1000:
         problem = f"plan {max(numbers)} among {len(numbers)} files"
-        return 0, [Finding("plans", "record", problem, "Move it out of the run")]
+        return [Finding("plans", "record", problem, "Move it out of the run")]
     for number in range(1, max(numbers) + 1):
         key, expected = f"plans/{number}.json", {"spec_hash": run.manifest.spec_hash, "number": number}
         ours, copy = (
@@ -146,14 +143,12 @@ def check_plans(run: Run) -> tuple[int, list[Finding]]:
         n = max(n, plan.n if plan else 0)
     if not n:
         findings.append(Finding("plans", "record", "has no plan with the number of samples wanted", fix))
-    return n, findings
+    return findings
 
 
 def check_notes(storage: Storage) -> Iterator[Finding]:
-    """Check records that no row depends on: of jobs, and of the origins of merged shards."""
-    lineage, copy = read(storage, LINEAGE, Lineage), read(storage, copy_key(LINEAGE), Lineage)
-    if {lineage.problem, copy.problem} != {"missing"}:
-        yield from compare(lineage, copy, fix=_BROKEN_OFF)
+    """Check the records of jobs, on which no row depends; their states may be torn by a power cut."""
     for file in storage.list("jobs"):
-        if file.key.endswith(".json") and (problem := read(storage, file.key, AnyRecord).problem):
+        is_record = file.key.endswith(".json") and not file.key.endswith(".state.json")
+        if is_record and (problem := read(storage, file.key, AnyRecord).problem):
             yield curable(file.key, "record", problem, SetAside())

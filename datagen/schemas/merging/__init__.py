@@ -1,4 +1,8 @@
-"""Merge separate runs into one run, or into merged runs of several parts, with links where possible."""
+"""Merge separate runs into one run, or into merged runs of several parts.
+
+Objects and commits are copied as they are; each step skips what is there, so that an interrupted merge is
+completed by running it again.
+"""
 
 from __future__ import annotations
 
@@ -7,36 +11,57 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.merging.plan import Union, common_layout, plan_union, refuse_incompatible
-from datagen.schemas.merging.writing import WrittenUnion, begin_union, replace_record, write_union
-from datagen.schemas.record_files import MAX_RECORD_BYTES, MERGED, encode_record, part_folder, refuse_foreign
+from datagen.schemas.merging.plan import (
+    Part,
+    Tick,
+    divide_scenes,
+    group_runs,
+    identity,
+    key_of,
+    largest_plan,
+    plan_part,
+    refuse_incompatible,
+)
+from datagen.schemas.record_files import (
+    MAX_RECORD_BYTES,
+    MERGED,
+    copy_key,
+    encode_record,
+    object_key,
+    publish,
+    refuse_foreign,
+)
 from datagen.schemas.run import Run, label_counts, open_runs
-from datagen.schemas.run_records import Layout, Merged
-from datagen.schemas.sealing import SEALED, seal, sealed_metadata
-from datagen.schemas.sealing.contents import read_contents
+from datagen.schemas.run_records import Commit, LedgerEntry, Merged, MergedPart, Plan
+from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage, open_storage
 
+SPARE_CAUSE = "merged: this shard is kept from another attempt"
 _ELSEWHERE = "Choose a new --out, and name this run among those to merge"
 
 
 @dataclass(frozen=True, eq=False)
 class MergePlan:
-    """Runs that can be merged: one union per specification, by ascending hash."""
+    """Runs that can be merged into `out`: their parts, and which scenes of each count."""
 
     out: str
-    existing: tuple[Run, ...]  # runs at `out` before the merge
-    unions: tuple[Union, ...]
-    hashes: tuple[str, ...]  # of all specifications in the result
-
-    @property
-    def is_ordinary(self) -> bool:
-        """Whether the result is one run; else it has several parts."""
-        return len(self.hashes) == 1
+    parts: tuple[Part, ...]
+    scenes: tuple[MergedPart, ...]
 
     @property
     def records(self) -> int:
-        """Upper bound of the shards and attempts to write: duplicates count in each source."""
-        return sum(len(union.kept) + sum(map(len, union.attempts)) for union in self.unions)
+        """The shards to write, and at most so many attempts."""
+        return sum(len(part.kept) for part in self.parts)
+
+
+@dataclass(frozen=True, eq=False)
+class WrittenPart:
+    """The result of a part. `there` counts shards that existed before, `spare` those of several sources."""
+
+    run: Run
+    there: int
+    copied: int
+    spare: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +69,11 @@ class MergeResult:
     """The result of a merge; `sealed` is the store's address, "" where nothing is committed."""
 
     storage: Storage
-    written: tuple[WrittenUnion, ...]
+    written: tuple[WrittenPart, ...]
     sealed: str
 
 
-def plan_merge(paths: Sequence[str], out: str, tick: Callable[[], None] = lambda: None) -> MergePlan:
+def plan_merge(paths: Sequence[str], out: str, tick: Tick = lambda: None) -> MergePlan:
     """Plan a merge without writing; `tick` is called for every commit that was read.
 
     A run at `out` is one of the sources. InputError when there is nothing to merge, when runs are of
@@ -57,59 +82,118 @@ def plan_merge(paths: Sequence[str], out: str, tick: Callable[[], None] = lambda
     if not paths:
         raise InputError("datagen merge", "RUN", "is missing", "Name the runs to merge")
     storage = _existing_storage(out)
-    has_runs = storage is not None and any(map(storage.exists, ("manifest.json", MERGED)))
-    existing = open_runs(storage) if storage is not None and has_runs else []
-    sources = list({_identity(run.storage): run for path in paths for run in open_runs(path)}.values())
-    refuse_incompatible(sources)
-    if existing:
-        refuse_incompatible([existing[0], *sources])
+    existing, is_merged = list[Run](), False
+    if storage is not None:
+        is_merged = storage.exists(MERGED)
+        existing = open_runs(storage) if is_merged or storage.exists("manifest.json") else []
+    sources = [run for path in paths for run in open_runs(path)]
+    refuse_incompatible([*existing, *sources])
     _refuse_nested(paths, out, existing, sources)
-    named = {_identity(run.storage) for run in existing}
-    groups: dict[str, list[Run]] = {run.manifest.spec_hash: [run] for run in existing}
-    for run in sources:
-        if _identity(run.storage) not in named:
-            groups.setdefault(run.manifest.spec_hash, []).append(run)
-    layout = common_layout(run.layout for group in groups.values() for run in group)
-    hashes = tuple(sorted(groups))
-    _refuse_unfit_output(existing, hashes, layout)
+    groups = group_runs([*existing, *sources])
+    if existing and not is_merged and len(groups) > 1:
+        problem = "is one run, and cannot hold runs of another specification or size of shards"
+        raise InputError(existing[0].storage.url, "manifest.json", problem, _ELSEWHERE)
     if storage is not None and not existing:
         # An interrupted merge may have left parts that no record names yet, and a draft of the record.
-        refuse_foreign(storage, *(("parts/", MERGED) if len(hashes) > 1 else ()))
-    here = {run.manifest.spec_hash for run in existing}
-    unions = tuple(
-        plan_union(groups[spec_hash], 0 if spec_hash in here else None, layout, tick)
-        for spec_hash in hashes
-        if spec_hash not in here or len(groups[spec_hash]) > 1
-    )
-    return MergePlan(out, tuple(existing), unions, hashes)
+        refuse_foreign(storage, *(("parts/", MERGED) if len(groups) > 1 else ()))
+    here = set(map(key_of, existing))
+    parts = tuple(plan_part(group, key in here, tick) for key, group in groups.items())
+    return MergePlan(out, parts, tuple(divide_scenes(parts)))
 
 
-def merge_runs(merge: MergePlan, tick: Callable[[], None] = lambda: None) -> MergeResult:
-    """Write a planned merge and seal it; `tick` is called for every shard and every attempt.
+def merge_runs(
+    merge: MergePlan,
+    tick: Tick = lambda: None,
+    sealing: Callable[[int, int], None] = lambda done, total: None,
+) -> MergeResult:
+    """Write a planned merge and seal it; `tick` is called for every shard, `sealing` as by `seal`.
 
-    Called again, it completes an interrupted merge, and changes nothing in a complete one.
+    Called again, it completes an interrupted merge, and changes nothing in a complete one. InputError where a
+    source lacks a committed object, or it is damaged.
     """
     storage = open_storage(merge.out)
-    runs: list[Run] = []
-    for union in merge.unions:
-        spec_hash = union.manifest.spec_hash
-        target = storage if merge.is_ordinary else storage.below(part_folder(spec_hash))
-        runs.append(begin_union(union, target))
-    # From here on the result counts as merged runs; shards that are not written yet are missing.
-    if not merge.is_ordinary:
-        replace_record(storage, MERGED, encode_record(Merged(parts=merge.hashes)))
-    written = [write_union(union, run, tick) for union, run in zip(merge.unions, runs, strict=True)]
-    return MergeResult(storage, tuple(written), _seal(storage))
+    is_one = len(merge.parts) == 1 and not storage.exists(MERGED)
+    written: list[WrittenPart] = []
+    for part in merge.parts:
+        plan = largest_plan(one for one in merge.parts if one.key[0] == part.key[0])
+        run = _begin(part, plan, storage if is_one else storage.below(part.folder))
+        written.append(_write(part, run, tick))
+    if not is_one:
+        _replace(storage, MERGED, encode_record(Merged(parts=merge.scenes)))
+    has_labels = label_counts(open_runs(storage)).labels > 0
+    return MergeResult(storage, tuple(written), seal(storage, sealing) if has_labels else "")
 
 
-def _seal(storage: Storage) -> str:
-    """Seal the result unless its store is up to date."""
-    if not label_counts(open_runs(storage)).labels:
-        return ""
-    root = sealed_metadata(read_contents(storage, check=False))["zarr.json"]
-    if storage.get(f"{SEALED}/zarr.json", 4 * MAX_RECORD_BYTES) == root:
-        return f"{storage.url}/{SEALED}"
-    return seal(storage)
+def _begin(part: Part, plan: Plan, storage: Storage) -> Run:
+    """Open the part's run with its manifest and plan, or create it."""
+    if not storage.exists("manifest.json"):
+        publish(storage, "manifest.json", encode_record(part.manifest))
+    run = Run.open(storage)
+    if key_of(run) != part.key:
+        problem = f"is of another run than {part.folder}"
+        raise InputError(f"{storage.url}/manifest.json", "spec_hash", problem, "Choose a new --out")
+    run.grow(plan.n, plan.created)
+    return run
+
+
+def _write(part: Part, run: Run, tick: Tick) -> WrittenPart:
+    storage, there = run.storage, run.committed()
+    new = [(part.runs[source], commit) for shard, (source, commit) in part.kept.items() if shard not in there]
+
+    def copy(one: tuple[Run, Commit]) -> None:
+        source, commit = one
+        storage.put_new(object_key(commit.attempt), source.read_object(commit))
+        run.commit(commit)
+
+    for _ in storage.concurrent_map(copy, new):
+        tick()
+    for source in part.runs:
+        if identity(source) != identity(run):
+            _copy_records(source, run)
+    for source, commit in part.spare:
+        if run.commit_of(commit.shard).attempt != commit.attempt:
+            run.ledger.end(_end_of_spare(part.runs[source], commit))
+    return WrittenPart(run, len(there), len(new), len(part.spare))
+
+
+def _copy_records(source: Run, run: Run) -> None:
+    """Copy the ledger, and the quarantine of shards that are not committed."""
+    there = {file.key for folder in ("ledger", "quarantine") for file in run.storage.list(folder)}
+    keys = [file.key for file in source.storage.list("ledger") if file.key.endswith(".json")]
+    keys += [f"quarantine/{shard:06d}.json" for shard in sorted(source.quarantined() - run.committed())]
+    new = [key for key in sorted(keys) if key not in there]
+    pairs = source.storage.get_many(new, MAX_RECORD_BYTES)
+
+    def put(pair: tuple[str, bytes | None]) -> None:
+        if pair[1] is not None:
+            run.storage.put_new(pair[0], pair[1])
+
+    for _ in (
+        map(put, pairs) if run.storage.folder is not None else run.storage.concurrent_map(put, list(pairs))
+    ):
+        pass
+
+
+def _end_of_spare(source: Run, commit: Commit) -> LedgerEntry:
+    start = source.ledger.start_of(commit.attempt)
+    return LedgerEntry(
+        attempt=commit.attempt,
+        shard=commit.shard,
+        outcome="superseded",
+        cause=SPARE_CAUSE,
+        started=start.started if start else "",
+        ended=commit.created,
+        cost=commit.cost,
+        host=commit.host,
+    )
+
+
+def _replace(storage: Storage, key: str, record: bytes) -> None:
+    """Write a record that may change, its copy first; unchanged ones are not written."""
+    for name in (copy_key(key), key):
+        if storage.get(name, MAX_RECORD_BYTES) != record:
+            storage.put(name, record)
+            storage.sync([name])
 
 
 def _existing_storage(out: str) -> Storage | None:
@@ -122,10 +206,6 @@ def _existing_storage(out: str) -> Storage | None:
         raise
 
 
-def _identity(storage: Storage) -> str:
-    return storage.url if storage.folder is None else str(storage.folder.resolve())
-
-
 def _address(path: str) -> str:
     if path.startswith("s3://"):
         return path.rstrip("/")
@@ -135,30 +215,8 @@ def _address(path: str) -> str:
 def _refuse_nested(paths: Sequence[str], out: str, existing: Sequence[Run], sources: Sequence[Run]) -> None:
     """Raise InputError where the result is inside a source or a source inside the result."""
     here, roots = _address(out), {_address(path) for path in paths}
-    known = {here, *(_identity(run.storage) for run in existing)}
-    for other in sorted({*roots, *(_identity(run.storage) for run in sources)} - known):
+    known = {here, *map(identity, existing)}
+    for other in sorted({*roots, *map(identity, sources)} - known):
         if here.startswith(f"{other}/") or other.startswith(f"{here}/"):
             problem = f"is inside {other}" if here.startswith(other) else f"contains {other}"
             raise InputError(out, "--out", problem, "Choose another folder for the result")
-
-
-def _refuse_unfit_output(existing: Sequence[Run], hashes: Sequence[str], layout: Layout) -> None:
-    """Raise InputError for runs that cannot be added to the run at `out`, whose shards are kept."""
-    if not existing:
-        return
-    first = existing[0]
-    if first.layout != layout:
-        raise InputError(
-            first.storage.url,
-            "layout.scenes_per_shard",
-            f"is {first.layout.scenes_per_shard}, but these runs need {layout.scenes_per_shard}",
-            _ELSEWHERE,
-        )
-    if len(existing) == 1 and len(hashes) > 1:
-        other = next(h for h in hashes if h != first.manifest.spec_hash)
-        raise InputError(
-            first.storage.url,
-            "spec_hash",
-            f"is one run, and cannot hold runs of another specification ({other[:16]})",
-            _ELSEWHERE,
-        )

@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import RecordSchema, SceneRows
-from datagen.schemas.record_files import shard_folder
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_scenes
 
@@ -20,8 +19,8 @@ from datagen.schemas.shard_reading import read_scenes
 def refuse_different_rows(one: Run, shard_one: int, other: Run, shard_other: int) -> None:
     """Raise InputError where two committed shards have different rows for a common scene.
 
-    It names both runs, the shard, the first differing file and the first differing sample. InputError also
-    for a damaged file.
+    It names both runs, the shard, and the first differing sample and field. InputError also for a damaged
+    object.
     """
     size, size_other = one.layout.scenes_per_shard, other.layout.scenes_per_shard
     first = max(size * shard_one, size_other * shard_other)
@@ -32,11 +31,10 @@ def refuse_different_rows(one: Run, shard_one: int, other: Run, shard_other: int
             continue
         field, row = found
         sample = bytes(ours.samples["sample_id"][row]).hex()
-        file = _first_file(one, shard_one, other, shard_other, field)
         raise InputError(
             one.storage.url,
             f"shard {shard_one}",
-            f"{other.storage.url} has other rows: {file} differs, first in sample {sample}, in {field}",
+            f"{other.storage.url} has other rows, first in sample {sample}, in {field}",
             "Run `datagen verify` on both, and merge without the wrong one",
         )
 
@@ -60,14 +58,3 @@ def _equal(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> bool:
     if a.dtype.kind == "O":
         return bool(np.array_equal(a, b))
     return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
-
-
-def _first_file(one: Run, shard_one: int, other: Run, shard_other: int, field: str) -> str:
-    """The first committed file that differs; the array's folder where the shards have other sizes."""
-    commit, theirs = one.commit_of(shard_one), other.commit_of(shard_other)
-    folder = shard_folder(shard_one, commit.attempt)
-    if one.layout != other.layout:
-        return f"{folder}/{field}"
-    digests = {entry.path: entry.sha256 for entry in theirs.files}
-    paths = sorted(e.path for e in commit.files if digests.get(e.path) != e.sha256)
-    return f"{folder}/{paths[0] if paths else field}"

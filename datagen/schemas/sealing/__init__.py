@@ -1,218 +1,142 @@
 """Seal runs: one flat Zarr v3 store over the committed shards, which any Zarr reader opens.
 
-Chunks are the shards' files (hard links, or copies by the object store's server), so no data is encoded;
-metadata is new. Shards are packed in order, and rows beyond the end are cut by the arrays' shape.
+The store is written once, shard by shard, with the shards' own chunks in a few large files (Zarr's sharding
+codec). It has a new name, and counts from the moment that `data.json` names it; then the one before it is
+removed.
 """
 
 from __future__ import annotations
 
-import ctypes
-import os
+import re
 import secrets
-import shutil
-import stat
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
-from pathlib import Path
+import warnings
+from collections.abc import Callable, Iterator
+from itertools import chain, count
 
-from datagen.schemas.errors import InputError
-from datagen.schemas.fields import Field
-from datagen.schemas.safe_files import sync_folder
+import zarr
+from zarr.core.buffer import default_buffer_prototype
+from zarr.storage import MemoryStore
+
+from datagen.schemas.fields import TABLES
+from datagen.schemas.record_files import encode_record
+from datagen.schemas.run_records import FileEntry
+from datagen.schemas.sealing.array_files import ArrayFiles
 from datagen.schemas.sealing.contents import (
-    ROOT,
+    RECORD,
     SEALED,
     Contents,
     SealedPart,
-    SealedRoot,
-    read_contents,
-    sealed_metadata,
-    sealed_root,
+    StoreRecord,
+    contents_of,
+    store_record,
 )
-from datagen.schemas.storage import Storage, storage_error
-from datagen.schemas.storage.errors import CANNOT_EXCHANGE, TAKEN
+from datagen.schemas.shard_files import cf_attributes, described, root_attributes, zarr_metadata
+from datagen.schemas.shard_reading import committed_place
+from datagen.schemas.storage import Storage
+from datagen.schemas.stored_arrays import arrays_of, parse_metadata
 
-__all__ = ["SEALED", "SealedPart", "SealedRoot", "seal", "sealed_metadata", "sealed_root", "unseal"]
+__all__ = ["SEALED", "SealedPart", "StoreRecord", "seal", "store_record"]
 
-_AT_FDCWD = -100
-_RENAME_EXCHANGE = 2
+_ROOT = "zarr.json"
+_NUMBERED = re.compile(r"data(?:-([0-9]+))?\.zarr")
+CLAIM = ".claim"  # beside a store: who made it first writes the store
+Tick = Callable[[int, int], None]
 
 
-def seal(storage: Storage) -> str:
-    """Make data.zarr over the committed shards of the run, or merged runs, in `storage`; return its address.
+def seal(storage: Storage, tick: Tick = lambda done, total: None) -> str:
+    """Write the store over the committed shards of the run, or merged runs, in `storage`; return its address.
 
-    Quarantined and missing shards are omitted. An older store is replaced atomically; linked files become
-    read-only. InputError when no shard is committed, a committed file is missing or of another size, merged
-    runs have different arrays, or the disk or the server fails.
+    Quarantined and missing shards are omitted. Nothing is written where the store is up to date. `tick` is
+    called with the number of shards written, and of all. InputError when no shard is committed, a shard is
+    missing or damaged, merged runs have different arrays, or the disk or the server fails.
     """
-    contents = read_contents(storage)
+    contents = contents_of(storage)
+    old = store_record(storage)
+    digest, parts = contents.digest(), contents.parts()
+    if old is not None and (old.rows_sha256, old.parts) == (digest, parts):
+        return f"{storage.url}/{old.name}"
+    name = _claimed_name(storage, old)
+    files = tuple(_write(storage, name, contents, tick))
+    new = StoreRecord(name=name, rows_sha256=digest, parts=parts, files=files)
+    storage.put(RECORD, encode_record(new))
+    storage.sync([RECORD])
+    if old is not None:
+        remove_store(storage, old.name)
+    return f"{storage.url}/{name}"
+
+
+def remove_store(storage: Storage, name: str) -> None:
+    """Remove a store and its claim, its root first, so that it is never readable in part."""
+    storage.delete([f"{name}/{_ROOT}"])
+    storage.delete([file.key for file in storage.list(name)])
+    storage.remove_empty(name)
+    storage.delete([f"{name}{CLAIM}"])
+
+
+def _claimed_name(storage: Storage, old: StoreRecord | None) -> str:
+    """`data.zarr`, or where a store of that name was begun before, the next of `data-2.zarr`, ..."""
+    before = _NUMBERED.fullmatch(old.name) if old else None
+    first = int(before[1] or 1) + 1 if before else 1
+    claim = secrets.token_bytes(8)  # its own bytes, so that another process's claim is not taken for it
+    names = (SEALED if number == 1 else f"data-{number}.zarr" for number in count(first))
+    return next(name for name in names if storage.put_new(f"{name}{CLAIM}", claim))
+
+
+def _write(storage: Storage, name: str, contents: Contents, tick: Tick) -> Iterator[FileEntry]:
+    """Write every file of the store durably, its root last; yield their entries."""
     metadata = sealed_metadata(contents)
-    if storage.folder is not None:
-        _seal_folder(contents, storage.folder, metadata)
-    else:
-        _seal_prefix(contents, metadata)
-    return f"{storage.url}/{SEALED}"
+    arrays = {
+        field.name: ArrayFiles(parse_metadata(name, field.name, metadata[f"{field.name}/{_ROOT}"]), field)
+        for _, field in contents.schema.fields
+    }
+
+    def put(path: str, data: bytes) -> FileEntry:
+        storage.put(key := f"{name}/{path}", data)
+        storage.sync([key])
+        return FileEntry.of(path, data)
+
+    shards = list(contents.shards)
+    for done, (sealed, commit, rows) in enumerate(shards, 1):
+        layout = sealed.run.layout
+        stored = arrays_of(contents.schema, layout)
+        place = committed_place(sealed.run, commit, rows)
+        is_whole = rows[:2] == (0, layout.scenes_per_shard) or (done == len(shards) and not rows.first)
+        aligned = all(files.is_aligned for files in arrays.values())
+        if layout == contents.layout and is_whole and aligned:
+            found = (arrays[array.name].add_chunk(chunk) for array, _, chunk in place.chunks(stored.values()))
+        else:
+            values = place.read(stored.values())
+            found = (arrays[array].add_rows(values[array]) for array in arrays)
+        for path, data in chain.from_iterable(found):
+            yield put(path, data)
+        tick(done, len(shards))
+    for files in arrays.values():
+        for path, data in files.close():
+            yield put(path, data)
+    for path in sorted(metadata, key=lambda path: path == _ROOT):
+        yield put(path, metadata[path])
 
 
-def unseal(storage: Storage) -> None:
-    """Remove data.zarr in `storage`, if any. The shards' files are kept. InputError as `seal`."""
-    if storage.folder is not None:
-        _unseal_folder(storage.folder)
-    else:
-        _unseal_prefix(storage)
-
-
-def _seal_folder(contents: Contents, folder: Path, metadata: Mapping[str, bytes]) -> None:
-    """Make `folder`/data.zarr from the chunks of the contents and the metadata, atomically.
-
-    The store is written durably as data.zarr.<hex>.partial and then renamed. An existing store is exchanged
-    with it in one step (Linux: renameat2), so that there is always a complete store; where that is not
-    supported, the old one is renamed first, and a kill between the two renames leaves none. InputError when
-    the disk fails.
-    """
-    draft, storage = _draft_of(folder), contents.storage
-    try:
-        files = {f"{draft.name}/{path}": data for path, data in metadata.items()}
-        storage.put_many(files)
-        for _, field in contents.schema.fields:
-            _link(contents, field, draft)
-        storage.sync(files)  # with every folder of the store, since each has metadata
-        old = _publish(draft, folder / SEALED)
-        sync_folder(folder)
-        _remove_tree(old)
-    except OSError as e:
-        raise storage_error(e.filename or draft, e) from e
-    finally:
-        _remove_tree(draft)
-
-
-def _unseal_folder(folder: Path) -> None:
-    """Remove `folder`/data.zarr: rename it, then delete it. InputError when the disk fails."""
-    draft = _draft_of(folder)
-    try:
-        (folder / SEALED).rename(draft)
-        sync_folder(folder)
-    except FileNotFoundError:
-        pass  # there is none, or another process was first
-    except OSError as e:
-        raise storage_error(folder / SEALED, e) from e
-    finally:
-        _remove_tree(draft)
-
-
-def _draft_of(folder: Path) -> Path:
-    """A new name for an incomplete or replaced store; `verify --clean` removes such names."""
-    return folder / f"{SEALED}.{secrets.token_hex(8)}.partial"
-
-
-def _remove_tree(path: Path) -> None:
-    """Remove a folder, a file or a link as far as possible."""
-    if path.is_symlink() or path.is_file():
-        path.unlink(missing_ok=True)
-    else:
-        shutil.rmtree(path, ignore_errors=True)
-
-
-def _link(contents: Contents, field: Field, draft: Path) -> None:
-    for _, source, name in contents.chunks(field):
-        contents.storage.adopt(contents.storage, source, f"{draft.name}/{field.name}/{name}")
-        target = draft / field.name / name
-        mode = target.lstat().st_mode
-        if not stat.S_ISREG(mode):
-            address = f"{contents.storage.url}/{source}"
-            raise InputError(address, "", "is not a regular file", "Restore the file from a copy")
-        if mode & 0o777 != 0o444:
-            target.chmod(0o444)
-
-
-def _publish(draft: Path, sealed: Path) -> Path:
-    """Rename the finished store; return the new name of an older one.
-
-    Another process may seal or unseal the run at any moment.
-    """
-    while True:
-        try:
-            draft.rename(sealed)  # onto nothing, or onto an empty folder
-            return draft
-        except OSError as e:
-            if e.errno not in TAKEN:
-                raise
-        with suppress(FileNotFoundError):
-            if _exchange(draft, sealed):
-                return draft
-            old = _draft_of(sealed.parent)
-            sealed.rename(old)
-            try:
-                draft.rename(sealed)
-                return old
-            except OSError as e:
-                if e.errno not in TAKEN:
-                    old.rename(sealed)
-                    raise
-                _remove_tree(old)
-
-
-def _exchange(one: Path, other: Path) -> bool:
-    """Exchange the names of two files or folders atomically; False where that is not supported."""
-    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if rename is None:
-        return False
-    if rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0:
-        return True
-    code = ctypes.get_errno()
-    if code in CANNOT_EXCHANGE:
-        return False
-    raise OSError(code, os.strerror(code), str(one), None, str(other))
-
-
-def _seal_prefix(contents: Contents, metadata: Mapping[str, bytes]) -> None:
-    """Make data.zarr from the chunks of the contents and the metadata, root last.
-
-    A store whose shards are the first of the new one stays readable: chunks are added, and the root is
-    replaced. Any other store is removed first, root first. A kill leaves the old store, the new one, or none;
-    objects without a root do not count.
-    """
-    storage = contents.storage
-    old = sealed_root(storage)
-    kept = contents.digests.index(old.rows_sha256) if old and old.rows_sha256 in contents.digests else 0
-    if not kept:
-        _unseal_prefix(storage)
-    _copy_chunks(contents, kept, tidy=True)
-    storage.put_many({f"{SEALED}/{path}": data for path, data in metadata.items() if path != ROOT})
-    storage.put(f"{SEALED}/{ROOT}", metadata[ROOT])
-    # Another process that seals or unseals may have removed chunks before the root was written: copy them
-    # again. Another seal does the same for its own store.
-    _copy_chunks(contents, len(contents.shards), tidy=False)
-
-
-def _unseal_prefix(storage: Storage) -> None:
-    """Remove data.zarr: its root, then the arrays' metadata, then the chunks, so that it is never readable
-    in part."""
-    storage.delete([f"{SEALED}/{ROOT}"])
-    storage.delete([f.key for f in storage.list(SEALED) if f.key.endswith(f"/{ROOT}")])
-    storage.delete(f.key for f in storage.list(SEALED))
-
-
-def _copy_chunks(contents: Contents, kept: int, tidy: bool) -> None:
-    """Copy all chunks except those of the first `kept` shards; `tidy` removes objects that are no chunks.
-
-    Chunks of a killed seal beyond those may belong to other shards, and are copied again.
-    """
-    for _, field in contents.schema.fields:
-        odd = _copy_array(contents, field, kept)
-        if tidy:
-            contents.storage.delete(odd)
-
-
-def _copy_array(contents: Contents, field: Field, kept: int) -> list[str]:
-    """Copy an array's chunks; return the keys of other objects."""
-    storage, folder = contents.storage, f"{SEALED}/{field.name}"
-    there = {f.key.removeprefix(f"{folder}/") for f in storage.list(folder)} - {ROOT}
-
-    def missing() -> Iterator[tuple[str, str]]:
-        for position, source, name in contents.chunks(field):
-            if not (name in there and position < kept):
-                yield source, f"{folder}/{name}"
-            there.discard(name)
-
-    storage.adopt_many(storage, missing())
-    return [f"{folder}/{name}" for name in sorted(there)]
+def sealed_metadata(contents: Contents) -> dict[str, bytes]:
+    """zarr.json files of the store by path; the root's has consolidated metadata."""
+    first = contents.runs[0].run.manifest
+    attributes = root_attributes(contents.schema, contents.layout, first.spec_hash)
+    parts = [
+        {**part.model_dump(mode="json"), "specification": sealed.run.manifest.spec.document()}
+        for sealed, part in zip(contents.runs, contents.parts(), strict=True)
+    ]
+    if len(parts) > 1:
+        del attributes["spec_hash"]
+    attributes |= {"parts": parts, "rows_sha256": contents.digest()}
+    specs = [sealed.run.manifest.spec for sealed in contents.runs]
+    attributes = described(specs, [sealed.n for sealed in contents.runs]) | attributes
+    rows = {table: contents.rows(table) for table in TABLES}
+    of_arrays = {f.name: cf_attributes(f, table) for table, f in contents.schema.fields}
+    files = zarr_metadata(contents.schema, contents.layout, rows, attributes, of_arrays, is_sharded=True)
+    make = default_buffer_prototype().buffer.from_bytes
+    store = {path: make(data) for path, data in files.items()}
+    with warnings.catch_warnings():
+        # Consolidated metadata is not in the Zarr v3 specification yet; common readers support it.
+        warnings.simplefilter("ignore")
+        zarr.consolidate_metadata(MemoryStore(store), zarr_format=3)
+    return {path: buffer.to_bytes() for path, buffer in store.items()}

@@ -91,6 +91,13 @@ class Storage:
         """The file's bytes, or None where it does not exist. InputError above the limit."""
         return self._try(key, lambda: self._files.get(key, limit_bytes))
 
+    def get_range(self, key: str, start: int, size: int) -> bytes | None:
+        """`size` bytes of a file from `start`, counted from its end where negative; None without the file.
+
+        Fewer bytes where the file ends before.
+        """
+        return self._try(key, lambda: self._files.get_range(key, start, size))
+
     def get_many(self, keys: Iterable[str], limit_bytes: int) -> Iterator[tuple[str, bytes | None]]:
         """Yield (key, bytes) of many files as `get` does, in the order of keys; some tens are in memory."""
         return self.concurrent_map(lambda key: (key, self.get(key, limit_bytes)), keys)
@@ -131,47 +138,16 @@ class Storage:
         if isinstance(files, LocalFiles):
             self._try(folder, lambda: files.remove_empty(folder))
 
-    def adopt(self, source: Storage, source_key: str, key: str, limit_bytes: int = 2**31) -> None:
-        """Link or copy a file of another storage, replacing an existing one. Not durable before `sync`.
-
-        It is a hard link on one file system, a copy by the server within one bucket, else the file is read
-        and written here. InputError where it does not exist, or where a file to be read is above the limit.
-        """
-        _checked(source.url, source_key)
-        ours, theirs = self._files, source._files
-        try:
-            if isinstance(ours, LocalFiles) and isinstance(theirs, LocalFiles):
-                self._try(key, lambda: ours.take(theirs, source_key, key), passes=FileNotFoundError)
-            elif isinstance(ours, LocalFiles) or isinstance(theirs, LocalFiles):
-                data = source.get(source_key, limit_bytes)
-                if data is None:
-                    raise FileNotFoundError
-                self.put(key, data)
-            else:
-                self._try(
-                    key, lambda: ours.take(theirs, source_key, key, limit_bytes), passes=FileNotFoundError
-                )
-        except FileNotFoundError as e:
-            fix = "Restore the file from a copy"
-            raise InputError(f"{source.url}/{source_key}", "", "no such file", fix) from e
-
-    def adopt_many(self, source: Storage, pairs: Iterable[tuple[str, str]], limit_bytes: int = 2**31) -> None:
-        """Link or copy many files of another storage, given as (its key, key here), as `adopt` does."""
-        remote = source if isinstance(self._files, LocalFiles) else self  # if either is remote
-        _exhaust(remote.concurrent_map(lambda pair: self.adopt(source, *pair, limit_bytes), pairs))
-
     def sync(self, keys: Iterable[str]) -> None:
         """Make files and their folders up to the root durable; objects are durable already."""
         files = self._files
         if isinstance(files, LocalFiles):
             files.sync(_checked(self.url, key) for key in keys)
 
-    def _try(self, key: str, do: Callable[[], Result], passes: type[OSError] | tuple[()] = ()) -> Result:
+    def _try(self, key: str, do: Callable[[], Result]) -> Result:
         _checked(self.url, key)
         try:
             return do()
-        except passes:
-            raise
         except OSError as e:
             raise storage_error(f"{self.url}/{key}", e) from e
 

@@ -14,11 +14,8 @@ from datagen.schemas.errors import InputError
 # Errors of the machine that any write can cause, whatever the shard.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
-# TAKEN: the name exists, or its folder is a file. NOT_LINKED: the file system allows no hard link between
-# these folders. CANNOT_EXCHANGE: it cannot exchange two names.
+# The name exists, or its folder is a file.
 TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)
-NOT_LINKED = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EACCES)
-CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
 MACHINE = (*FULL, *FORBIDDEN, errno.EMFILE, errno.ENAMETOOLONG)
 
 _FIXES = {

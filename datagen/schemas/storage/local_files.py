@@ -18,7 +18,6 @@ from pathlib import Path
 
 from datagen.schemas.safe_files import sync_folder
 from datagen.schemas.storage.errors import (
-    NOT_LINKED,
     TAKEN,
     NotARegularFile,
     storage_error,
@@ -31,7 +30,6 @@ _STEP = getattr(os, "O_PATH", os.O_RDONLY) | os.O_DIRECTORY | os.O_NOFOLLOW | os
 # Without O_NONBLOCK, opening a pipe waits for a writer.
 _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _DRAFT = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-_COPIED_AT_ONCE = 2**20
 _MAX_DEPTH = 32
 _KINDS = {
     stat.S_IFLNK: "a symbolic link",
@@ -60,6 +58,7 @@ class LocalFiles:
     def __init__(self, root: Path, prefix: tuple[str, ...] = ()) -> None:
         self.root, self.prefix = root, prefix
         self.folder = root.joinpath(*prefix)
+        self._durable: set[tuple[str, ...]] = set()  # folders whose own names this process made durable
 
     @staticmethod
     def make_root(folder: Path) -> None:
@@ -89,7 +88,9 @@ class LocalFiles:
                 os.link(draft, name, src_dir_fd=here, dst_dir_fd=here, follow_symlinks=False)
             except FileExistsError:
                 return False
-        self._sync_folders(_with_parents(folders))
+        # The folders above hold a new name only where the folder itself is new.
+        self._sync_folders([folders] if folders in self._durable else _with_parents(folders))
+        self._durable.add(folders)
         return True
 
     def get(self, key: str, limit_bytes: int) -> bytes | None:
@@ -102,6 +103,14 @@ class LocalFiles:
             if size > limit_bytes:
                 raise too_large(f"{self.folder}/{key}", size, limit_bytes)
             return _read(fd, size)
+
+    def get_range(self, key: str, start: int, size: int) -> bytes | None:
+        try:
+            fd = self._open_file(key)
+        except FileNotFoundError:
+            return None
+        with _closing(fd):
+            return os.pread(fd, size, start if start >= 0 else max(0, os.fstat(fd).st_size + start))
 
     def exists(self, key: str) -> bool:
         folders, name = _split(key)
@@ -137,26 +146,6 @@ class LocalFiles:
                 for child in below:
                     _remove_folder(child, fd)
             _remove_folder(name, here)
-
-    def take(self, source: LocalFiles, source_key: str, key: str) -> None:
-        """Hard-link a file of `source`, or copy it where that is impossible; replaces an existing file."""
-        from_folders, from_name = _split(source_key)
-        folders, name = _split(key)
-        with _closing(source._walk(from_folders)) as there:
-            seen = os.stat(from_name, dir_fd=there, follow_symlinks=False)
-            source._refuse_odd(seen.st_mode, source_key)
-            with _closing(self._walk(folders, make=True)) as here:
-                with suppress(FileNotFoundError):
-                    if os.path.samestat(seen, os.stat(name, dir_fd=here, follow_symlinks=False)):
-                        return
-                with _drafted(name, here) as draft:
-                    try:
-                        os.link(from_name, draft, src_dir_fd=there, dst_dir_fd=here, follow_symlinks=False)
-                    except OSError as e:
-                        if e.errno not in NOT_LINKED:
-                            raise
-                        source._copy(source_key, draft, here)
-                    os.rename(draft, name, src_dir_fd=here, dst_dir_fd=here)
 
     def sync(self, keys: Iterable[str]) -> None:
         """Call fsync on each file, and on each folder from there up to the root, leaves first.
@@ -232,14 +221,6 @@ class LocalFiles:
             place = f"{self.folder}/{key}"
             fix = "Remove it, or replace it by a copy of the file"
             raise NotARegularFile(place, "", f"{where or 'is '}{kind}, which a run never has", fix)
-
-    def _copy(self, key: str, draft: str, into: int) -> None:
-        with (
-            _closing(self._open_file(key)) as fd,
-            _closing(os.open(draft, _DRAFT, 0o666, dir_fd=into)) as target,
-        ):
-            while data := os.read(fd, _COPIED_AT_ONCE):
-                _write_all(target, data)
 
 
 @contextmanager

@@ -12,7 +12,6 @@ import re
 import time
 from collections.abc import Callable, Iterable, Iterator
 from datetime import timedelta
-from functools import cached_property
 from itertools import islice
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
@@ -150,6 +149,17 @@ class RemoteObjects:
         except FileNotFoundError:
             return None
 
+    def get_range(self, key: str, start: int, size: int) -> bytes | None:
+        part: Any = {"range": (start, start + size) if start >= 0 else {"suffix": -start}}
+
+        def get() -> bytes:
+            return bytes(obstore.get(self._store, key, options=part).bytes())
+
+        try:
+            return self._try(key, get)
+        except FileNotFoundError:
+            return None
+
     def exists(self, key: str) -> bool:
         try:
             self._try(key, lambda: obstore.head(self._store, key))
@@ -184,21 +194,6 @@ class RemoteObjects:
                 self._try(some[0], lambda some=some: obstore.delete(self._store, some))
             except FileNotFoundError:
                 continue
-
-    def take(self, source: RemoteObjects, source_key: str, key: str, limit_bytes: int) -> None:
-        """Copy an object of `source`: by the server within one bucket. FileNotFoundError if there is none."""
-        if source.bucket == self.bucket:
-            from_, to = f"{source.prefix}/{source_key}".lstrip("/"), f"{self.prefix}/{key}".lstrip("/")
-            self._try(key, lambda: obstore.copy(self._bucket, from_, to))
-            return
-        data = source.get(source_key, limit_bytes)
-        if data is None:
-            raise FileNotFoundError(source_key)
-        self.put(key, data)
-
-    @cached_property
-    def _bucket(self) -> Any:
-        return self._open("")
 
     def _open(self, prefix: str) -> Any:
         timeout = timedelta(seconds=self._timeout_s)

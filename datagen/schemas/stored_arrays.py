@@ -1,0 +1,146 @@
+"""Arrays as they are stored: their metadata, the paths of their chunks, and the values in these.
+
+Metadata and chunks are not trusted: sizes are checked before memory is allocated for them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import google_crc32c
+import numpy as np
+import numpy.typing as npt
+from numcodecs.vlen import VLenUTF8
+from numcodecs.zstd import Zstd
+
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import RecordSchema
+from datagen.schemas.run_records import Layout
+from datagen.schemas.shard_files import MAX_TEXT_BYTES, group_metadata
+
+Array = npt.NDArray[Any]
+
+MAX_META_BYTES = 2**20
+MAX_DECODED_BYTES = 2**30  # far above any real chunk
+_MAX_PER_FILE = 2**20
+DAMAGE_FIX = "Restore the file from a copy, or set the shard aside with `datagen verify --repair`"
+
+
+@dataclass(frozen=True)
+class StoredArray:
+    """Metadata of an array; rows and chunk rows are along the first axis, `dims[0]`.
+
+    `per_file` chunks lie in one file of a sealed store, with an index (Zarr's sharding codec); 0 where each
+    is a file.
+    """
+
+    name: str
+    dtype: str
+    shape: tuple[int, ...]
+    chunk_rows: int
+    per_file: int
+    dims: tuple[str, ...]
+    attributes: Mapping[str, Any]
+
+    @property
+    def is_text(self) -> bool:
+        return self.dtype == "string"
+
+
+def parse_metadata(place: str, name: str, data: bytes) -> StoredArray:
+    """Parse a zarr.json. InputError for metadata that datagen does not write."""
+    try:
+        meta = json.loads(data)
+        dtype, shape, dims = meta["data_type"], tuple(meta["shape"]), tuple(meta["dimension_names"])
+        chunk = file = tuple(meta["chunk_grid"]["configuration"]["chunk_shape"])
+        codecs = meta["codecs"]
+        if codecs[0]["name"] == "sharding_indexed":
+            sharding = codecs[0]["configuration"]
+            chunk, inner = tuple(sharding["chunk_shape"]), sharding["codecs"]
+            index = [codec["name"] for codec in sharding["index_codecs"]], sharding["index_location"]
+            if len(codecs) != 1 or index != (["bytes", "crc32c"], "end"):
+                raise ValueError("unknown form of sharding")
+            codecs = inner
+        names = tuple(codec["name"] for codec in codecs)
+        first = "vlen-utf8" if dtype == "string" else "bytes"
+        item_bytes = 1 if dtype == "string" else np.dtype(dtype).itemsize
+        if dtype != "string" and np.dtype(dtype).kind not in "biuf":
+            raise ValueError(f"data type {dtype}")
+        if item_bytes > 1 and codecs[0]["configuration"]["endian"] != "little":
+            raise ValueError("not little-endian")
+        if meta["zarr_format"] != 3 or names != (first, "zstd", "crc32c"):
+            raise ValueError(f"codecs {names}")
+        if meta["chunk_key_encoding"] != {"name": "default", "configuration": {"separator": "."}}:
+            raise ValueError("unknown form of chunk keys")
+        if dims[0] not in ("scene", "sample") or not len(dims) == len(shape) == len(chunk) == len(file):
+            raise ValueError("dimensions do not match the shape")
+        if not all(isinstance(x, int) and x > 0 for x in (*shape, *chunk, *file)):
+            raise ValueError(f"chunks {chunk} of shape {shape}")
+        if not chunk[1:] == file[1:] == shape[1:] or file[0] % chunk[0]:
+            raise ValueError(f"chunks {chunk} of shape {shape}")
+        if math.prod(chunk) * item_bytes > MAX_DECODED_BYTES or file[0] // chunk[0] > _MAX_PER_FILE:
+            raise ValueError(f"chunks of {chunk}")
+        per_file = file[0] // chunk[0] if codecs is not meta["codecs"] else 0
+        attributes = dict(meta.get("attributes") or {})
+        return StoredArray(name, dtype, shape, chunk[0], per_file, dims, attributes)
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as e:
+        problem = f"is not the metadata of a run's array ({type(e).__name__}: {e})"
+        raise InputError(place, "", problem, DAMAGE_FIX) from e
+
+
+@lru_cache(maxsize=16)
+def arrays_of(schema: RecordSchema, layout: Layout) -> Mapping[str, StoredArray]:
+    """The arrays of every shard of runs with this schema and layout, by name."""
+    files = group_metadata(schema, layout, "")
+    paths = {field.name: f"{field.name}/zarr.json" for _, field in schema.fields}
+    return {name: parse_metadata(path, name, files[path]) for name, path in paths.items()}
+
+
+def decode_chunk(place: str, array: StoredArray, data: bytes) -> Array:
+    """Decode a chunk's values, (chunk_rows, ...). InputError naming `place` for damaged bytes."""
+    packed = data[:-4]
+    if len(data) < 5 or google_crc32c.value(packed) != int.from_bytes(data[-4:], "little"):
+        raise InputError(place, array.name, "the crc32c does not match: the file is damaged", DAMAGE_FIX)
+    shape = (array.chunk_rows, *array.shape[1:])
+    count = math.prod(shape)
+    try:
+        if array.is_text:
+            if _content_bytes(packed) > min(4 + count * (4 + MAX_TEXT_BYTES), MAX_DECODED_BYTES):
+                raise ValueError("too much text")
+            raw = Zstd().decode(packed)
+            if int.from_bytes(raw[:4], "little") != count:  # before memory is allocated for them
+                raise ValueError("another number of names")
+            return VLenUTF8().decode(raw).reshape(shape)
+        out = np.empty(shape, np.dtype(array.dtype).newbyteorder("<"))
+        if _content_bytes(packed) != out.nbytes:
+            raise ValueError(f"{_content_bytes(packed)} bytes")
+        Zstd().decode(packed, out)
+        return out
+    except (ValueError, RuntimeError) as e:
+        raise InputError(
+            place, array.name, f"does not hold {shape} of {array.dtype} ({e})", DAMAGE_FIX
+        ) from e
+
+
+def chunk_path(array: StoredArray, index: int) -> str:
+    """Path of a chunk, or of a file of chunks."""
+    return f"{array.name}/" + ".".join(["c", str(index), *("0" for _ in array.shape[1:])])
+
+
+def _content_bytes(frame: bytes) -> int:
+    """Content size that a zstd frame's header states (RFC 8878, 3.1.1.1); ValueError if none."""
+    if frame[:4] != b"\x28\xb5\x2f\xfd" or len(frame) < 6:
+        raise ValueError("not a zstd frame")
+    flags = frame[4]
+    single_segment = flags >> 5 & 1
+    start = 5 + (0 if single_segment else 1) + (0, 1, 2, 4)[flags & 3]
+    width = (1 if single_segment else 0, 2, 4, 8)[flags >> 6]
+    if width == 0 or len(frame) < start + width:
+        raise ValueError("a zstd frame without content size")
+    size = int.from_bytes(frame[start : start + width], "little")
+    return size + 256 if width == 2 else size
