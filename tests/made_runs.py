@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from datagen.schemas.errors import InputError
 from datagen.schemas.fields import Field, RecordSchema, sized_schema
 from datagen.schemas.identity import sample_ids
 from datagen.schemas.outcomes import REDRAW_CAUSES
-from datagen.schemas.record_files import shard_folder, utc_now
+from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import (
     Commit,
@@ -79,30 +77,27 @@ def attempt(run: Run, shard: int, name: str) -> bool:
     run.ledger.start(name, shard)
     commit = write(run, shard, name)
     won = run.commit(commit)
-    outcome = "committed" if won else "superseded"
-    run.ledger.end(
-        LedgerEntry(
-            attempt=name, shard=shard, outcome=outcome, ended=utc_now(), cost=commit.cost, host=commit.host
-        )
-    )
+    if not won:
+        entry = LedgerEntry(attempt=name, shard=shard, outcome="superseded", ended=utc_now())
+        run.ledger.end(entry.model_copy(update={"cost": commit.cost, "host": commit.host}))
     return won
 
 
 def write(run: Run, shard: int, attempt: str) -> Commit:
     """Write a shard of random rows; its commit record, not yet published."""
     scenes, samples = rows_of(run, shard)
-    files = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
+    data = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
     sums = dict(zip(REDRAW_CAUSES, scenes["redraws"].sum(axis=0).tolist(), strict=True))
     redraws = {cause: count for cause, count in sums.items() if count}
-    entries = run.write_shard(shard, attempt, files)
-    return commit_of(run, shard, attempt, entries, int(samples["label"].sum()), redraws)
+    entry = run.write_object(attempt, data)
+    return commit_of(run, shard, attempt, entry, int(samples["label"].sum()), redraws)
 
 
 def commit_of(
     run: Run,
     shard: int,
     attempt: str,
-    files: tuple[FileEntry, ...],
+    entry: FileEntry,
     positives: int = 0,
     redraws: Mapping[str, int] | None = None,
 ) -> Commit:
@@ -114,7 +109,7 @@ def commit_of(
         samples=run.layout.samples_per_shard,
         positives=positives,
         redraws=dict(redraws or {}),
-        files=files,
+        object=entry,
         cost=Cost(wall_s=1.0, cpu_s=1.0),
         host=Host(name="h", cpu="c", cores=1, memory_bytes=1),
         created=utc_now(),
@@ -184,12 +179,3 @@ def files_of(folder: Path, *below: str) -> dict[str, bytes]:
     roots = [folder / name for name in below] or [folder]
     files = [p for root in roots for p in sorted(root.rglob("*")) if p.is_file()]
     return {str(p.relative_to(folder)): p.read_bytes() for p in files}
-
-
-def check_digests(run: Run, commit: Commit) -> None:
-    """Raise InputError for a commit one of whose files is missing or has other bytes than were committed."""
-    run.check_files(commit)
-    folder = shard_folder(commit.shard, commit.attempt)
-    for entry in commit.files:
-        if sha256(run.storage.get(f"{folder}/{entry.path}", entry.size) or b"").hexdigest() != entry.sha256:
-            raise InputError(f"{run.storage.url}/{folder}/{entry.path}", "sha256", "other bytes", "")
