@@ -51,8 +51,14 @@ _STEP_M = 0.001
 # Step between sampled reaches: opening an arm of another reach costs as much as planning ten candidates.
 REACH_STEP_M = 0.01
 _LIBRARIES = ("numpy", "scipy", "embreex", "sapien", "pybullet", "zarr", "obstore", "ray", "trimesh")
-_SCENES_PER_SHARD = 32
-_SHARDS_AT_LEAST = 8
+# What a shard should have: at most a minute of work, which a lost attempt repeats, and tens of megabytes; enough
+# work that 40 ms of writing are little; and so many shards that the workers share a run evenly.
+_LONGEST_S, _SHORTEST_S = 60.0, 2.0
+_MOST_BYTES = 32 * 2**20
+_SHARDS, _SHARDS_AT_LEAST = 64, 8
+# Core seconds of a label, scene included, and bytes of a cloud's point (docs/results/speed.md).
+_LABEL_S = {"heuristic": 0.002, "plan": 0.02, "sim": 0.5}
+_POINT_BYTES = 10
 
 
 def specify(
@@ -134,12 +140,15 @@ def validated(fields: dict[str, Any], place: str) -> Specification:
 
 
 def layout_of(spec: Specification, n: int) -> Layout:
-    """The layout: shards of about 32 scenes, or fewer in a small run, so that workers share it evenly.
+    """The layout: shards by time and bytes, and smaller ones in a small run.
 
     A number of scenes that divides evenly is preferred, so that no label beyond n is made.
     """
     scenes = -(-n // spec.candidates.count)
-    most = max(1, min(_SCENES_PER_SHARD, scenes // _SHARDS_AT_LEAST))
+    scene_s = spec.candidates.count * _LABEL_S.get(spec.label_source, _LABEL_S["plan"])
+    largest = min(_LONGEST_S / scene_s, _MOST_BYTES / (_POINT_BYTES * spec.observation.n_points))
+    shared = max(scenes // _SHARDS, min(scenes // _SHARDS_AT_LEAST, int(_SHORTEST_S / scene_s)))
+    most = max(1, min(int(largest), shared))
     even = next((k for k in range(most, most // 2, -1) if scenes % k == 0), most)
     return Layout(scenes_per_shard=even, candidates_per_scene=spec.candidates.count)
 

@@ -93,12 +93,12 @@ def test_a_layout_holds_n_and_wastes_less_than_a_shard(n: int) -> None:
     layout = layout_of(SPEC, n)
     shards = layout.shards_for(n)
     assert (shards - 1) * layout.samples_per_shard < n <= shards * layout.samples_per_shard
-    assert 1 <= layout.scenes_per_shard <= 32
+    assert 1 <= layout.scenes_per_shard <= 500  # a minute of work
 
 
 def test_the_papers_number_of_labels_divides_into_whole_shards() -> None:
     layout = layout_of(SPEC, 180_000)
-    assert layout.scenes_per_shard == 30
+    assert layout.scenes_per_shard == 40
     assert layout.shards_for(180_000) * layout.samples_per_shard == 180_000
 
 
