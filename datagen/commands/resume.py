@@ -95,18 +95,20 @@ def resume(options: ResumeOptions) -> JobResult:
 
 def _extend(job_runs: Sequence[JobRun], n: int, path: str) -> None:
     """Raise the number of labels to n in total. InputError where it is smaller now, or scenes are lacking."""
-    runs = [job_run.run for job_run in job_runs]
-    have = [run.n for run in runs]
-    if n < sum(have):
-        problem = f"{path} already has {sum(have):,} planned, and a run never shrinks"
-        raise InputError("--n", str(n), problem, f"Give {sum(have)} or more")
-    wanted = shares(have, [run.layout.samples_per_shard for run in runs], n)
-    for job_run, more in zip(job_runs, wanted, strict=True):
+    planned = sum(job_run.run.samples_wanted(job_run.run.n) for job_run in job_runs)
+    if n < planned:
+        problem = f"{path} already has {planned:,} planned, and a run never shrinks"
+        raise InputError("--n", str(n), problem, f"Give {planned} or more")
+    growing = [job_run for job_run in job_runs if job_run.run.can_grow]
+    have = [job_run.run.n for job_run in growing]
+    sizes = [job_run.run.layout.samples_per_shard for job_run in growing]
+    wanted = shares(have, sizes, sum(have) + n - planned)
+    for job_run, more in zip(growing, wanted, strict=True):
         if job_run.scenes_from:
             stored = StoredScenes(Run.open(job_run.scenes_from), job_run.houses, job_run.objects)
             refuse_too_few(stored, job_run.run.layout, more)
-    for run, more in zip(runs, wanted, strict=True):
-        run.grow(more)
+    for job_run, more in zip(growing, wanted, strict=True):
+        job_run.run.grow(more)
 
 
 def shares(have: Sequence[int], per_shard: Sequence[int], n: int) -> list[int]:

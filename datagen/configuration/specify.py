@@ -51,7 +51,7 @@ _STEP_M = 0.001
 # Step between sampled reaches: opening an arm of another reach costs as much as planning ten candidates.
 REACH_STEP_M = 0.01
 _LIBRARIES = ("numpy", "scipy", "embreex", "sapien", "pybullet", "zarr", "obstore", "ray", "trimesh")
-# What a shard should have: at most a minute of work, which a lost attempt repeats, and tens of megabytes; enough
+# A shard has at most a minute of work, which a lost attempt repeats, and at most tens of megabytes; enough
 # work that 40 ms of writing are little; and so many shards that the workers share a run evenly.
 _LONGEST_S, _SHORTEST_S = 60.0, 2.0
 _MOST_BYTES = 32 * 2**20

@@ -62,6 +62,9 @@ class JobOptions:
     ] = None
     address: Annotated[str, option("local, or the address of a Ray cluster.", RUNNING)] = "local"
     detach: Annotated[bool, option(_DETACH, RUNNING)] = False
+    no_seal: Annotated[bool, option("Leave out the joint store data.zarr; readers open runs.", RUNNING)] = (
+        False
+    )
     json: Annotated[bool, option("Print progress as JSON lines to standard error.", RUNNING)] = False
     quiet: Annotated[bool, Parameter(parse=False)] = False  # the command line always reports progress
 
@@ -235,11 +238,10 @@ class Job:
         if summary.end == "aborted":
             fix = f"Then resume: {command_line(self.resume)}"
             raise _CannotContinue(self.path, "", f"the job cannot continue: {summary.cause}", fix)
-        does_seal = summary.end != "interrupted" and any(run.committed() for run in runs)
         return JobResult(
             path=self.path,
             end=summary.end,
-            n=sum(run.n for run in runs),
+            n=sum(run.samples_wanted(run.n) for run in runs),
             made_from="; ".join(dict.fromkeys(run.manifest.made_from for run in runs)),
             labels=totals.labels,
             positives=totals.positives,
@@ -249,10 +251,15 @@ class Job:
             retries=totals.retries,
             start_s=summary.start_s,
             elapsed_s=summary.elapsed_s,
-            store=seal(self.storage) if does_seal else "",
+            store="" if summary.end == "interrupted" or self.options.no_seal else self._seal(runs),
             cause=summary.cause or (causes.most_common(1)[0][0] if causes else ""),
             resume=tuple(self.resume),
         )
+
+    def _seal(self, runs: Sequence[Run]) -> str:
+        shards = sum(len(run.committed()) for run in runs)
+        with self.options.display() as shown:
+            return seal(self.storage, shown.counter("shards sealed")) if shards else ""
 
 
 class _CannotContinue(InputError):

@@ -38,7 +38,8 @@ def with_absolute_paths(options: Options) -> Options:
 
 def words_to_resume(path: str, options: JobOptions, moved: Sources = AS_FOUND) -> list[str]:
     """The words of the command that resumes a run in the same way; `moved`: new locations of its sources."""
-    where = given_options(JobOptions(workers=options.workers, address=options.address))
+    kept = JobOptions(workers=options.workers, address=options.address, no_seal=options.no_seal)
+    where = given_options(kept)
     if jobs_api := os.environ.get(JOBS_API):  # a detached job is detached again
         where = {"--detach": True, "--address": None if head_token(jobs_api) else jobs_api}
     sources = {

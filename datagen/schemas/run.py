@@ -34,6 +34,7 @@ from datagen.schemas.record_files import (
     utc_now,
 )
 from datagen.schemas.run_records import (
+    OPEN_END,
     Commit,
     FileEntry,
     Layout,
@@ -175,6 +176,11 @@ class Run:
                 span = (spans.pop()[0], span[1])
             spans += [span] if span[0] < span[1] else []
         return ShardRanges.between(spans)
+
+    @property
+    def can_grow(self) -> bool:
+        """Whether scenes beyond the planned ones would count."""
+        return self.scenes is None or any(past == OPEN_END for _, past in self.scenes.ranges)
 
     def samples_wanted(self, n: int) -> int:
         """Of the first n samples those that count."""

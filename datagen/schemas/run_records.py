@@ -100,6 +100,7 @@ class Plan(StoredRecord):
 
 
 _Number = Annotated[int, Field(ge=0, le=10**18)]
+OPEN_END = 10**18  # of the scenes of a part that a resume extends
 Ranges = tuple[tuple[_Number, _Number], ...]  # first and one past the last of each
 
 

@@ -12,7 +12,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.merging.conflicts import refuse_different_rows
 from datagen.schemas.record_files import different_fields, encode_record, part_folder
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Commit, Layout, Manifest, MergedPart, Plan, ShardRanges
+from datagen.schemas.run_records import OPEN_END, Commit, Layout, Manifest, MergedPart, Plan, ShardRanges
 
 # Fields that may differ between merged runs: they give other samples of the same kind.
 FREE_FIELDS = ("seed", "split", "houses", "objects", "scenes_from")
@@ -113,10 +113,8 @@ def divide_scenes(parts: Sequence[Part]) -> list[MergedPart]:
             _refuse_conflicts(group[:number], part, taken)
             extra.append(part.scenes.without(taken))
             taken, later = taken.union(part.scenes), later.union(extra[-1])
-        each = group[0].layout.candidates_per_scene
-        end = -(-largest_plan(group).n // each)
-        planned = ShardRanges.of(range(end)).union(taken)
-        for part, scenes in zip(group, [planned.without(later), *extra], strict=True):
+        all_scenes = ShardRanges.between([(0, OPEN_END)])
+        for part, scenes in zip(group, [all_scenes.without(later), *extra], strict=True):
             found.append(MergedPart(folder=part.folder, spec_hash=spec_hash, scenes=scenes.ranges))
     return found
 
