@@ -83,6 +83,7 @@ class Faults:
     cut: float = 0.0  # done; the answer breaks off in the middle of its body
     lost_creates: int = 0  # every so many-th create-only put, of commits and of others: done, answered 500
     hold_s: float = 0.0
+    delay_s: float = 0.0  # before every request
     seed: int = 0
     down_after: list[int] = field(default_factory=list[int])  # counts of requests after which all fails
     down_at_commits: list[int] = field(default_factory=list[int])  # done, not answered, then all fails
@@ -153,6 +154,7 @@ def faulty_proxy(upstream: int, faults: Faults) -> Generator[int]:
         def handle_any(self) -> None:
             body = self.rfile.read(int(self.headers.get("content-length") or 0))
             kind = faults.kind(self.path, "if-none-match" in self.headers)
+            time.sleep(faults.delay_s)
             if kind in ("error", "down"):
                 status, text = random.choice([(500, _BROKEN), (503, _BUSY)])
                 return self._answer(status, {}, text)

@@ -241,13 +241,7 @@ class Run:
         return FileEntry.of(f"{attempt}.zip", data)
 
     def commit(self, commit: Commit) -> bool:
-        """Commit a shard. False where another attempt is committed; the rows are then garbage.
-
-        InputError where the attempt's rows are missing, for example removed by `datagen verify --clean`.
-        """
-        if not self.storage.exists(key := object_key(commit.attempt)):
-            place = f"{self.storage.url}/{key}"
-            raise InputError(place, "", "is missing", "Make the shard again with `datagen resume`")
+        """Commit a shard whose object is written. False where another attempt is; the object is then garbage."""
         return self.storage.put_new(commit_key(commit.shard), encode_record(commit))
 
     def read_object(self, commit: Commit) -> bytes:

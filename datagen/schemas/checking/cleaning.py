@@ -1,7 +1,7 @@
 """Remove the files of a run that no record names: of unfinished or superseded attempts, drafts and probes.
 
 It is refused while a job is alive, and keeps files of the last hour, which a merge or a worker whose driver
-has died may still write. An attempt whose object is removed cannot be committed: `Run.commit` needs it.
+has died may still write and commit.
 """
 
 from __future__ import annotations
