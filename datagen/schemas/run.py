@@ -241,7 +241,7 @@ class Run:
         return FileEntry.of(f"{attempt}.zip", data)
 
     def commit(self, commit: Commit) -> bool:
-        """Commit a shard whose object is written. False where another attempt is; the object is then garbage."""
+        """Commit a shard whose object is written. False where another attempt is, and the object is spare."""
         return self.storage.put_new(commit_key(commit.shard), encode_record(commit))
 
     def read_object(self, commit: Commit) -> bytes:
