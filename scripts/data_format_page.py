@@ -23,8 +23,12 @@ frame; range): meaning. Schema version {SCHEMA_VERSION}. No stored array is rena
 _TAIL = f"""## Encoding
 
 Chunks hold the rows of one shard, or an equal part of them where these exceed {MAX_CHUNK_BYTES // 2**20}
-MiB. Codecs: little-endian bytes (text: vlen-utf8), zstd level {ZSTD_LEVEL}, crc32c. Every chunk is written,
-so a missing file is damage.
+MiB. Codecs: little-endian bytes (text: vlen-utf8), zstd level {ZSTD_LEVEL}, crc32c. Every chunk is written.
+In `data.zarr` many chunks share a file, with an index (Zarr's `sharding_indexed`); a shard's object is an
+uncompressed zip, which `zarr.storage.ZipStore` opens.
+
+The crc32c finds a changed chunk, but not two exchanged ones: plain `zarr.open` reads those in silence.
+`datagen verify` and the project's own readers compare whole files with their sha256.
 
 Attributes of arrays: `units` (SI), `long_name`, `frame`, `valid_min`, `valid_max`, `coordinates`, and
 `flag_values` with `flag_meanings`. The root has consolidated metadata, the specification and, by
@@ -33,29 +37,29 @@ Attributes of arrays: `units` (SI), `long_name`, `frame`, `valid_min`, `valid_ma
 
 ## A run
 
-Run format {FORMAT_VERSION}. A run is a folder (or an object-store prefix). A shard's files count only once
+Run format {FORMAT_VERSION}. A run is a folder (or an object-store prefix). A shard's object counts only once
 its commit exists. Shards hold whole scenes and are equally long; `data.zarr` is cut to n samples ([how a
 run is stored](../explanation/runs.md)).
 
 ```
 RUN/
-  data.zarr/                     the sealed store over all committed shards
+  data.zarr/                     the sealed store; after the run has grown data-2.zarr, ...
+  data.json                      the store that counts: its name, parts, and files with sha256
   manifest.json                  specification, hash, schema version, layout; written once
   plans/<k>.json                 samples wanted; the highest k counts
-  shards/<shard>/<attempt>/      an immutable, flat Zarr v3 group with the rows of one shard
-  commits/<shard>.json           written last, create-only: attempt, digests of files, cost
-  copies/...                     second copies of records; a commit's is in its attempt's folder
+  shards/<attempt>.zip           an immutable, flat Zarr v3 group with the rows of one shard
+  commits/<shard>.json           written last, create-only: attempt, size and sha256 of its object, cost
+  copies/...                     second copies of manifest, plans and merged.json
   ledger/<attempt>.start.json    an attempt began
-  ledger/<attempt>.json          how it ended: outcome, cause, stack, cost
+  ledger/<attempt>.json          how one without a commit ended: outcome, cause, stack, cost
   quarantine/<shard>.json        a quarantined shard: seeds, causes, stacks; .lifted-<k>.json: tried again
   jobs/<job>.json                a driver; .state.json is its state, .stop a stop request
   set-aside/<time>/...           damaged shards and records that `verify --repair` moved away; not read
-  lineage.json                   of a merged run: the runs that made its shards
 ```
 
-Merged runs of several specifications ([merge](../guides/merge.md)) have `merged.json`, with the hashes of
-their parts in the order of their rows, `parts/<hash>/`, each a whole run as above, and one `data.zarr` over
-all.
+Merged runs of several specifications or sizes of shards ([merge](../guides/merge.md)) have `merged.json`, with
+their parts in the order of their rows and the scenes of each that count, `parts/<hash>-<size>/`, each a whole
+run as above, and one `data.zarr` over all.
 
 Every JSON record ends with the sha256 of all bytes before it: its last key, on a line of its own.
 """
