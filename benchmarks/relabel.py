@@ -46,7 +46,6 @@ def main() -> None:
 
 def _print(run: Run, samples: int, wall_s: float, cpu_s: float) -> None:
     written = sum(commit.cost.written_bytes for commit in run.commits())
-    shared = sum(entry.size for commit in run.commits() for entry in commit.files) - written
     stages: dict[str, float] = {}
     for commit in run.commits():
         for stage, seconds in commit.cost.stage_cpu_s.items():
@@ -56,7 +55,6 @@ def _print(run: Run, samples: int, wall_s: float, cpu_s: float) -> None:
     for stage, name in (("draw", "read"), ("visibility", "label"), ("write", "write")):
         print(f"{f'  {name}':<24} {stages.get(stage, 0.0):>8.1f} s CPU")
     print(f"{'written a label':<24} {written / samples:>8.1f} bytes")
-    print(f"{'shared a label':<24} {shared / samples:>8.1f} bytes")
 
 
 if __name__ == "__main__":

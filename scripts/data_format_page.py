@@ -57,8 +57,8 @@ RUN/
   set-aside/<time>/...           damaged shards and records that `verify --repair` moved away; not read
 ```
 
-Merged runs of several specifications or sizes of shards ([merge](../guides/merge.md)) have `merged.json`, with
-their parts in the order of their rows and the scenes of each that count, `parts/<hash>-<size>/`, each a whole
+Merged runs of several specifications or sizes of shards ([merge](../guides/merge.md)) have `merged.json`,
+with their parts in the order of their rows and the scenes of each that count, `parts/<hash>-<size>/`, each a whole
 run as above, and one `data.zarr` over all.
 
 Every JSON record ends with the sha256 of all bytes before it: its last key, on a line of its own.

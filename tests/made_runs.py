@@ -11,7 +11,7 @@ import numpy as np
 from datagen.schemas.fields import Field, RecordSchema, sized_schema
 from datagen.schemas.identity import sample_ids
 from datagen.schemas.outcomes import REDRAW_CAUSES
-from datagen.schemas.record_files import utc_now
+from datagen.schemas.record_files import commit_key, encode_record, object_key, utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import (
     Commit,
@@ -23,7 +23,8 @@ from datagen.schemas.run_records import (
     Manifest,
     QuarantineRecord,
 )
-from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.shard_files import encode_shard, zipped
+from datagen.schemas.shard_sources import ZipFiles
 from datagen.schemas.specification import ObservationParams, SceneParams, Source, Specification
 from datagen.schemas.storage import open_storage
 
@@ -114,6 +115,33 @@ def commit_of(
         host=Host(name="h", cpu="c", cores=1, memory_bytes=1),
         created=utc_now(),
     )
+
+
+def with_files(data: bytes, changed: Mapping[str, bytes]) -> bytes:
+    """A shard's object with other or further files."""
+    files = ZipFiles("object", data)
+    return zipped({path: files.get(path) for path in files.paths} | dict(changed))
+
+
+def resign(run: Run, attempt: str, changed: Mapping[str, bytes]) -> None:
+    """Change files in the object of a committed attempt, and its commit as if they were its own."""
+    commit = next(commit for commit in run.commits() if commit.attempt == attempt)
+    data = with_files(run.read_object(commit), changed)
+    run.storage.put(object_key(attempt), data)
+    signed = commit.model_copy(update={"object": FileEntry.of(f"{attempt}.zip", data)})
+    run.storage.put(commit_key(commit.shard), encode_record(signed))
+
+
+def object_of(folder: Path, shard: int) -> Path:
+    """The file of a committed shard's rows."""
+    return folder / object_key(Run.open(folder).commit_of(shard).attempt)
+
+
+def flip(file: Path) -> None:
+    """Change one bit in the middle of a file."""
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(bytes(data))
 
 
 def rows_of(run: Run, shard: int) -> Tables:

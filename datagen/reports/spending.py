@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from math import fsum
 
+from datagen.schemas.record_files import is_guess
 from datagen.schemas.run import MOST_SAMPLES, Run
 from datagen.schemas.run_records import Cost
 
@@ -82,8 +83,9 @@ def account_for(runs: Iterable[Run]) -> Spending:
             spending.scenes += rows.scenes
             spending.useful.add(commit.cost)
         for end in run.ledger.ends():
-            spending.contradictions += end.outcome == "committed" or end.attempt in committed
-            if end.attempt not in committed:
+            if end.attempt in committed:
+                spending.contradictions += not is_guess(end)
+            else:
                 kind = QUARANTINED if end.shard in quarantined else end.outcome
                 spending.waste.setdefault(kind, Account()).add(end.cost)
                 if end.cause:

@@ -205,7 +205,7 @@ class Ledger:
         if self._storage.put_new(key, encode_record(kept)):
             return True
         noted = self.end_of(entry.attempt)
-        if kept.cost is None or noted is None or noted.outcome != "lost" or noted.cost is not None:
+        if kept.cost is None or noted is None or not is_guess(noted):
             return False
         self._storage.put(key, encode_record(kept))
         self._storage.sync([key])
@@ -239,6 +239,11 @@ class Ledger:
             for file in self._storage.list("ledger")
             if file.key.endswith(".json")
         }
+
+
+def is_guess(end: LedgerEntry) -> bool:
+    """Whether it is one of `lost_end`: the attempt may know better, and may even have committed."""
+    return end.outcome == "lost" and end.cost is None
 
 
 def lost_end(start: AttemptStart, ended: str = "", cause: str = LOST_CAUSE) -> LedgerEntry:

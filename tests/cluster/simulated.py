@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from datagen.cluster.driver import AttemptOrder
 from datagen.cluster.protocol import AttemptReport, JobTotals
 from datagen.cluster.shard_policy import RetryPolicy, ShardFailures
-from datagen.schemas.run_records import Commit, Cost, Host, LedgerEntry, ShardRanges
+from datagen.schemas.run_records import Commit, Cost, FileEntry, Host, LedgerEntry, ShardRanges
 
 # How an attempt ends, and the seconds it takes; None never ends by itself.
 Fate = tuple[str, float | None]
@@ -48,7 +48,8 @@ def commit_by(shard: int, attempt: str, samples: int = 10) -> Commit:
     host = Host(name="h", cpu="c", cores=1, memory_bytes=1)
     return Commit(
         shard=shard, attempt=attempt, spec_hash="0" * 64, scenes=1, samples=samples, positives=3,
-        redraws={}, files=(), cost=Cost(wall_s=6.0, cpu_s=3.0), host=host, created="",
+        redraws={}, object=FileEntry.of("a.zip", b""),
+        cost=Cost(wall_s=6.0, cpu_s=3.0), host=host, created="",
     )  # fmt: skip
 
 

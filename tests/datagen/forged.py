@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from datagen.schemas.record_files import commit_copy_key, commit_key, encode_record
+from datagen.schemas.record_files import commit_key, encode_record
 from datagen.schemas.run import Run
 from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.shard_reading import read_shard
@@ -25,12 +25,11 @@ def forge(source: Path, out: Path, shard: int, change: Callable[[Columns], None]
     change(arrays)
     scenes = {f.name: arrays[f.name] for f in run.schema.scene_fields}
     samples = {f.name: arrays[f.name] for f in run.schema.sample_fields}
-    files = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
+    data = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
     commit = run.commit_of(shard)
-    entries = run.write_shard(shard, "forged", files)
-    forged = encode_record(commit.model_copy(update={"attempt": "forged", "files": entries}))
-    for key in (commit_copy_key(shard, "forged"), commit_key(shard)):
-        run.storage.put(key, forged)
+    entry = run.write_object("forged", data)
+    forged = encode_record(commit.model_copy(update={"attempt": "forged", "object": entry}))
+    run.storage.put(commit_key(shard), forged)
     return Run.open(out)
 
 

@@ -15,7 +15,7 @@ import pytest
 from datagen import cli
 from datagen.schemas.record_files import signed_json
 from datagen.schemas.run import Run
-from tests.made_runs import check_digests
+from tests.made_runs import flip, object_of
 from tests.refusals import refused
 from tests.small_runs import CONFIG, PER_SCENE, files_of, submit_arguments
 
@@ -94,31 +94,21 @@ def test_a_damaged_run(
     if verb == "audit" and key.startswith("plans"):
         verb = "status"  # an audit counts what is there, whatever was planned
     damage(copied / key)
-    before = _all_but_index(copied)
+    before = files_of(copied)
     arguments = {
         "submit": submit_arguments(copied, 3 * PER_SCENE),
         "show": ["show", str(copied), "--out", str(copied.parent / "a.png")],
     }
     refused(arguments.get(verb, [verb, str(copied)]), capsys, f"{copied}/{key}", *words)
-    assert _all_but_index(copied) == before
+    assert files_of(copied) == before
     assert not (copied.parent / "a.png").exists()
 
 
-def _all_but_index(run: Path) -> dict[str, bytes]:
-    """Every file of a run, without the index of what is sound, which any job may bring up to date."""
-    return {name: data for name, data in files_of(run).items() if not name.startswith("index/")}
-
-
 def test_a_shard_file_that_was_changed(copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    commit = Run.open(copied).commit_of(0)
-    folder = copied / "shards" / "000000" / commit.attempt
-    file = next(folder / e.path for e in commit.files if e.path.endswith("/c.0"))
-    file.chmod(0o644)
-    data = bytearray(file.read_bytes())
-    data[len(data) // 2] ^= 1
-    file.write_bytes(bytes(data))
+    file = object_of(copied, 0)
+    flip(file)
     picture = copied.parent / "a.png"
-    refused(["show", str(copied), "--out", str(picture)], capsys, str(folder))
+    refused(["show", str(copied), "--out", str(picture)], capsys, str(file))
     assert not picture.exists()
 
 
@@ -127,10 +117,10 @@ def test_a_shard_file_that_was_changed(copied: Path, capsys: pytest.CaptureFixtu
 
 @pytest.fixture
 def tiny_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 256 kB, less than a small run needs."""
+    """A file system of 96 kB, less than a small run needs."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)]
+    command = ["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", str(disk)]
     if os.geteuid() != 0 or shutil.which("mount") is None or subprocess.run(command, check=False).returncode:
         pytest.skip("mounting a small file system needs the rights of root")
     yield disk
@@ -147,4 +137,4 @@ def test_a_full_disk(tiny_disk: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert len(told) == 1 and "No space left on device" in told[0] and "resume" in told[0].lower()
     assert not (run / "data.zarr").exists()
     for commit in Run.open(run).commits():  # what counts is whole
-        check_digests(Run.open(run), commit)
+        Run.open(run).read_object(commit)

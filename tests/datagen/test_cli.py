@@ -32,7 +32,7 @@ def interrupt() -> None:
 
 
 def fill_disk() -> None:
-    raise OSError(errno.ENOSPC, "No space left on device", "RUN/shards/0/c")
+    raise OSError(errno.ENOSPC, "No space left on device", "RUN/shards/0.zip")
 
 
 def deny() -> None:
@@ -64,7 +64,7 @@ def with_verbs(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         (["refuse-input"], 2, ["run.toml", "scene.n_clutter", "is -1", "0 to 30"]),
         (["interrupt"], 130, ["interrupted"]),
-        (["fill-disk"], 2, ["RUN/shards/0/c", "No space left on device. Free disk space"]),
+        (["fill-disk"], 2, ["RUN/shards/0.zip", "No space left on device. Free disk space"]),
         (["deny"], 2, ["RUN", "Permission denied", "permission"]),
         (["answer", "--n", "many"], 2, ["--n", "many", "int"]),
         (["answer", "--m", "1"], 2, ["--m", "--help"]),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,10 @@ from datagen import cli
 from datagen.schemas.jobs import JobRecord, Jobs, new_job_id
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import LedgerEntry
 from tests.datagen.forged import forge
+from tests.made_runs import object_of
 from tests.refusals import refused
-from tests.small_runs import HERE, PER_SCENE, files_of
+from tests.small_runs import HERE, PER_SCENE, arrays_of, assert_equal_runs, files_of
 
 
 def verified(run: Path, capture: pytest.CaptureFixture[str], code: int, *more: str) -> dict[str, Any]:
@@ -40,7 +39,6 @@ def test_a_finished_run_is_clean_and_its_scenes_are_made_again(
     assert (report["clean"], report["findings"], report["sealed"]) == (True, [], True)
     assert report["replay"] == {"asked": 9, "done": True}
     assert report["samples"] == 3 * PER_SCENE
-    assert report["files"] == sum(len(c.files) for c in Run.open(finished).commits())
     ledger = report["ledger"]
     assert ledger["wall_s"] == ledger["commits_wall_s"] + ledger["waste_wall_s"] > 0
     assert files_of(finished) == before
@@ -52,11 +50,11 @@ def test_damaged_shards_are_set_aside_and_made_again(
     finished: Path, copied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (copied / "plans/1.json").unlink()
-    chunk = next((copied / "shards/000000").glob("*/rgb/c.0.0.0"))
-    truncate(chunk)
+    rows = object_of(copied, 0)
+    truncate(rows)
     report = verified(copied, capsys, 1, "--replay", "1")
     assert report["counts"] == {"file": 1, "record": 1} and not report["replay"]["done"]
-    assert [f["file"] for f in report["findings"]] == ["plans/1.json", str(chunk.relative_to(copied))]
+    assert [f["file"] for f in report["findings"]] == ["plans/1.json", str(rows.relative_to(copied))]
     assert all(f["repairable"] for f in report["findings"])
     assert cli.run(["verify", str(copied)]) == 1
     told = capsys.readouterr().out
@@ -65,13 +63,13 @@ def test_damaged_shards_are_set_aside_and_made_again(
     done = verified(copied, capsys, 0, "--repair", "--clean")["repaired"]
     assert (done["restored"], done["set_aside"], done["sealed"]) == (
         ["plans/1.json"],
-        ["shards/000000"],
+        ["commits/000000.json"],
         True,
     )
-    assert (copied / done["into"] / chunk.relative_to(copied)).exists()
+    assert (copied / done["into"] / rows.relative_to(copied)).exists()
     assert cli.run(["resume", str(copied), *HERE]) == 0
     assert verified(copied, capsys, 0, "--replay", "3")["clean"]
-    assert files_of(copied, "data.zarr") == files_of(finished, "data.zarr")
+    assert_equal_runs(arrays_of(copied), arrays_of(finished))
 
 
 def test_a_merged_run_is_repaired_and_resumed(
@@ -79,11 +77,12 @@ def test_a_merged_run_is_repaired_and_resumed(
 ) -> None:
     out = tmp_path / "merged"
     assert cli.run(["merge", str(finished), "--out", str(out)]) == 0
-    whole, shard = files_of(out, "data.zarr"), next((out / "shards/000001").iterdir())
-    shutil.rmtree(shard / "label")
-    assert verified(out, capsys, 0, "--repair")["repaired"]["set_aside"] == ["shards/000001"]
+    whole = arrays_of(out)
+    object_of(out, 1).unlink()
+    assert verified(out, capsys, 0, "--repair")["repaired"]["set_aside"] == ["commits/000001.json"]
     assert cli.run(["resume", str(out), *HERE]) == 0
-    assert files_of(out, "data.zarr") == whole and verified(out, capsys, 0)["clean"]
+    assert_equal_runs(arrays_of(out), whole)
+    assert verified(out, capsys, 0)["clean"]
 
 
 def test_replay_finds_rows_that_do_not_follow_from_the_specification(
@@ -95,12 +94,11 @@ def test_replay_finds_rows_that_do_not_follow_from_the_specification(
 
     run = forge(finished, tmp_path / "run", 1, change)
     run.ledger.start("forged", 1)
-    run.ledger.end(LedgerEntry(attempt="forged", shard=1, outcome="committed", cost=run.commit_of(1).cost))
     assert verified(tmp_path / "run", capsys, 0, "--repair")["clean"]
     report = verified(tmp_path / "run", capsys, 1, "--replay", "3")
     (finding,) = report["findings"]
     assert (finding["kind"], finding["shard"], finding["repairable"]) == ("replay", 1, False)
-    assert finding["file"] == "shards/000001/forged"
+    assert finding["file"] == "shards/forged.zip"
     assert "settle_steps: 1 differ, by up to 1" in finding["problem"] and "visibility: " in finding["problem"]
 
 

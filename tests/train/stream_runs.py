@@ -11,7 +11,7 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
 from datagen.schemas.shard_files import chunk_key, encode_chunk, encode_shard
 from datagen.schemas.storage import open_storage
-from tests.made_runs import Tables, commit_of, manifest_of, rows_of, small_spec
+from tests.made_runs import Tables, commit_of, manifest_of, rows_of, small_spec, with_files
 
 ROBOT_FIELDS = ("camera_height_m", "base_height_m", "arm_reach_m")
 HOUSES = 7
@@ -34,13 +34,14 @@ def make_stream_run(
     run = Run.create_or_open(open_storage(folder), manifest, n)
     for shard in run.missing():
         scenes, samples = stream_rows(run, shard, robots)
-        files = encode_shard(run.schema, layout, manifest.spec_hash, scenes, samples)
+        data = encode_shard(run.schema, layout, manifest.spec_hash, scenes, samples)
+        changed: dict[str, bytes] = {}
         for field in (*run.schema.scene_fields, *run.schema.sample_fields):
             if field.name in changes:
                 values = np.full_like((scenes | samples)[field.name], changes[field.name])
-                files[f"{field.name}/{chunk_key(field, 0)}"] = encode_chunk(field, values)
-        entries = run.write_shard(shard, f"a-{shard}", files)
-        assert run.commit(commit_of(run, shard, f"a-{shard}", entries, int(samples["label"].sum())))
+                changed[f"{field.name}/{chunk_key(field, 0)}"] = encode_chunk(field, values)
+        entry = run.write_object(f"a-{shard}", with_files(data, changed))
+        assert run.commit(commit_of(run, shard, f"a-{shard}", entry, int(samples["label"].sum())))
     return run
 
 

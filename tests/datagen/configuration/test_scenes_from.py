@@ -11,6 +11,7 @@ import pytest
 from datagen import cli
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import QuarantineRecord
+from tests.made_runs import flip, object_of
 from tests.refusals import refused
 from tests.small_runs import CONFIG, PER_SCENE, arrays_of, files_of, json_of, make_small_run
 from tests.workers.objects.toy_set import write_bundle
@@ -147,17 +148,12 @@ def test_objects_may_have_moved_but_not_changed(tmp_path: Path, capsys: pytest.C
 def test_a_damaged_source_gives_its_shard_up_and_no_label(source: Path, tmp_path: Path) -> None:
     damaged, out = tmp_path / "damaged", tmp_path / "run"
     shutil.copytree(source, damaged, ignore=shutil.ignore_patterns("data.zarr"))
-    commit = Run.open(damaged).commit_of(3)
-    file = damaged / f"shards/000003/{commit.attempt}/points_m/c.0.0.0"
-    data = bytearray(file.read_bytes())
-    data[len(data) // 2] ^= 1
-    file.chmod(0o644)
-    file.write_bytes(bytes(data))
+    flip(object_of(damaged, 3))
     assert cli.run(again_arguments(damaged, out, N)) == 1
     run = Run.open(out)
     assert run.quarantined() == {3} and len(run.committed()) == SCENES - 1
     (record,) = run.quarantine_records()
-    assert isinstance(record, QuarantineRecord) and "points_m" in record.causes[-1]
+    assert isinstance(record, QuarantineRecord) and "another sha256" in record.causes[-1]
 
 
 @pytest.mark.parametrize("within", ["clear", "in-range"])

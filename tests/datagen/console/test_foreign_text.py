@@ -10,7 +10,6 @@ from datagen import cli
 from datagen.console.printing import print_lines, print_rows
 from datagen.display.html_page import escape
 from datagen.schemas.jobs import JobRecord, Jobs, JobState
-from datagen.schemas.lineage import LINEAGE, ShardOrigin, encode_lineage
 from datagen.schemas.run_records import LedgerEntry
 from tests.made_runs import give_up, make_run
 
@@ -41,8 +40,6 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
         jobs.put_state(JobState(id=job, updated=AT, phase="making", end=end, cause=EVIL, stopping=EVIL))
         if not end:
             jobs.ask_to_stop(job, at_once=False)
-    origin = ShardOrigin(address=f"/runs/{EVIL}", created=AT, platform=EVIL, code_version=EVIL)
-    run.storage.put(LINEAGE, encode_lineage({origin: [0, 2, 4]}))
     return Path(run.storage.url)
 
 

@@ -72,7 +72,7 @@ def test_nothing_is_read_before_it_is_used(runs: tuple[Path, Path], monkeypatch:
 
     def noting(self: ShardPlace, arrays):  # type: ignore[no-untyped-def]
         found = list(arrays)
-        read.extend(f"{self.folder} {array.name}" for array in found)
+        read.extend(f"{self.url} {array.name}" for array in found)
         return real(self, found)
 
     monkeypatch.setattr(ShardPlace, "read", noting)
@@ -80,7 +80,7 @@ def test_nothing_is_read_before_it_is_used(runs: tuple[Path, Path], monkeypatch:
     assert read == []
     dataset["points_m"].isel(scene=0).load()
     arrays = ("scene_index", "house_id", "points_m")  # it, and its coordinates
-    assert set(read) == {f"shards/000000/a-0 {name}" for name in arrays}
+    assert set(read) == {f"{runs[1]}/shards/a-0.zip {name}" for name in arrays}
 
 
 def test_a_table_joins_candidates_with_their_scenes(runs: tuple[Path, Path]) -> None:
