@@ -58,8 +58,8 @@ RUN/
 ```
 
 Merged runs of several specifications or sizes of shards ([merge](../guides/merge.md)) have `merged.json`,
-with their parts in the order of their rows and the scenes of each that count, `parts/<hash>-<size>/`, each a whole
-run as above, and one `data.zarr` over all.
+with their parts in the order of their rows and the scenes of each that count, `parts/<hash>-<size>/`, each a
+whole run as above, and one `data.zarr` over all.
 
 Every JSON record ends with the sha256 of all bytes before it: its last key, on a line of its own.
 """
