@@ -89,7 +89,6 @@ class Faults:
     down_at_commits: list[int] = field(default_factory=list[int])  # done, not answered, then all fails
     down_for_s: float = 0.0  # after a commit: long enough for its writer to give up
     forgets_create_only: bool = False  # a store that knows no If-None-Match
-    late_error_of_copies: int = 0  # copies that answer 200 with an error in the body, and are not made
     script: list[str] = field(default_factory=list[str])  # kinds for the next requests, in turn
     seen: Counter[str] = field(default_factory=Counter[str])
     down: bool = False
@@ -177,9 +176,6 @@ def faulty_proxy(upstream: int, faults: Faults) -> Generator[int]:
 
         def _forward(self, body: bytes) -> tuple[int, Mapping[str, str], bytes]:
             headers = {k: v for k, v in self.headers.items() if k.lower() not in _HOP}
-            if "x-amz-copy-source" in self.headers and faults.late_error_of_copies > 0:
-                faults.late_error_of_copies -= 1
-                return 200, {"Content-Type": "application/xml"}, _BROKEN
             if faults.forgets_create_only:
                 headers = {k: v for k, v in headers.items() if k.lower() != "if-none-match"}
             if "if-none-match" in self.headers:

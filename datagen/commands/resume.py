@@ -95,20 +95,25 @@ def resume(options: ResumeOptions) -> JobResult:
 
 def _extend(job_runs: Sequence[JobRun], n: int, path: str) -> None:
     """Raise the number of labels to n in total. InputError where it is smaller now, or scenes are lacking."""
-    planned = sum(job_run.run.samples_wanted(job_run.run.n) for job_run in job_runs)
+    # Parts of one specification, in shards of other sizes, share its number of labels.
+    growing = list({job_run.run.manifest.spec_hash: job_run for job_run in reversed(job_runs)}.values())[::-1]
+    have = [job_run.run.n for job_run in growing]
+    planned = sum(have)
     if n < planned:
         problem = f"{path} already has {planned:,} planned, and a run never shrinks"
         raise InputError("--n", str(n), problem, f"Give {planned} or more")
-    growing = [job_run for job_run in job_runs if job_run.run.can_grow]
-    have = [job_run.run.n for job_run in growing]
     sizes = [job_run.run.layout.samples_per_shard for job_run in growing]
-    wanted = shares(have, sizes, sum(have) + n - planned)
-    for job_run, more in zip(growing, wanted, strict=True):
+    wanted = {
+        job_run.run.manifest.spec_hash: more
+        for job_run, more in zip(growing, shares(have, sizes, n), strict=True)
+    }
+    for job_run in job_runs:
+        more = wanted[job_run.run.manifest.spec_hash]
         if job_run.scenes_from:
             stored = StoredScenes(Run.open(job_run.scenes_from), job_run.houses, job_run.objects)
             refuse_too_few(stored, job_run.run.layout, more)
-    for job_run, more in zip(growing, wanted, strict=True):
-        job_run.run.grow(more)
+    for job_run in job_runs:
+        job_run.run.grow(wanted[job_run.run.manifest.spec_hash])
 
 
 def shares(have: Sequence[int], per_shard: Sequence[int], n: int) -> list[int]:

@@ -34,7 +34,6 @@ from datagen.schemas.record_files import (
     utc_now,
 )
 from datagen.schemas.run_records import (
-    OPEN_END,
     Commit,
     FileEntry,
     Layout,
@@ -169,18 +168,7 @@ class Run:
         size, end = self.layout.scenes_per_shard, self.layout.shards_for(self.n if n is None else n)
         if self.scenes is None:
             return ShardRanges.of(range(end))
-        spans: list[tuple[int, int]] = []
-        for first, past in self.scenes.ranges:
-            span = (first // size, min(-(-past // size), end))
-            if spans and span[0] <= spans[-1][1]:  # two ranges may share a shard
-                span = (spans.pop()[0], span[1])
-            spans += [span] if span[0] < span[1] else []
-        return ShardRanges.between(spans)
-
-    @property
-    def can_grow(self) -> bool:
-        """Whether scenes beyond the planned ones would count."""
-        return self.scenes is None or any(past == OPEN_END for _, past in self.scenes.ranges)
+        return self.scenes.blocks(size).within(ShardRanges.of(range(end)))
 
     def samples_wanted(self, n: int) -> int:
         """Of the first n samples those that count."""

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, overload
 
 import numpy as np
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -101,7 +102,17 @@ class Plan(StoredRecord):
 
 _Number = Annotated[int, Field(ge=0, le=10**18)]
 OPEN_END = 10**18  # of the scenes of a part that a resume extends
-Ranges = tuple[tuple[_Number, _Number], ...]  # first and one past the last of each
+
+
+def _ascending(ranges: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
+    numbers = [number for each in ranges for number in each]
+    if numbers != sorted(numbers) or any(first == past for first, past in ranges):
+        raise ValueError("the ranges are not ascending")
+    return ranges
+
+
+# First and one past the last of each range.
+Ranges = Annotated[tuple[tuple[_Number, _Number], ...], AfterValidator(_ascending)]
 
 
 class MergedPart(StoredRecord):
@@ -177,7 +188,7 @@ class Commit(StoredRecord):
     """commits/<shard>.json: written last and create-only; readers trust nothing else."""
 
     format_version: int = FORMAT_VERSION
-    shard: int = Field(ge=0)
+    shard: int = Field(ge=0, le=10**12)
     attempt: AttemptName
     spec_hash: Digest
     scenes: int = Field(ge=0)
@@ -293,6 +304,16 @@ class ShardRanges(Sequence[int]):
                 first, past = merged[-1][0], max(merged.pop()[1], past)
             merged.append((first, past))
         return ShardRanges.between(merged)
+
+    def times(self, size: int) -> ShardRanges:
+        """The numbers in the blocks of `size` consecutive numbers that these count."""
+        return ShardRanges(self.bounds * size)
+
+    def blocks(self, size: int) -> ShardRanges:
+        """The blocks of `size` consecutive numbers that hold one of these."""
+        first, past = self.bounds[:, 0] // size, -(-self.bounds[:, 1] // size)
+        first = np.maximum(first, np.concatenate([[0], past])[: len(first)])  # two ranges may share a block
+        return ShardRanges(np.stack([first, past], axis=1)[first < past])
 
     def within(self, others: ShardRanges) -> ShardRanges:
         return self.without(self.without(others))

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import object_key
 from datagen.schemas.run import Run
+from datagen.schemas.safe_files import DAMAGED_ZIP
 from datagen.schemas.storage import Storage
 from datagen.schemas.stored_arrays import (
     DAMAGE_FIX,
@@ -75,6 +76,10 @@ class ShardObject:
         return ZipFiles(self.url, data)
 
 
+# OverflowError: an offset that no file has.
+_DAMAGED = (*DAMAGED_ZIP, OverflowError)
+
+
 class ZipFiles:
     """The files in a shard's object. InputError where it is not such a zip, or lacks a file."""
 
@@ -82,7 +87,7 @@ class ZipFiles:
         self._place = place
         try:
             self._zip = zipfile.ZipFile(io.BytesIO(data))
-        except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError, UnicodeDecodeError) as e:
+        except _DAMAGED as e:
             raise InputError(place, "", f"is not the object of a shard ({e})", DAMAGE_FIX) from e
         self.paths = [entry.filename for entry in self._zip.infolist()]
 
@@ -94,7 +99,7 @@ class ZipFiles:
             return self._zip.read(entry)
         except KeyError as e:
             raise InputError(f"{self._place}/{path}", "", "no such file", DAMAGE_FIX) from e
-        except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError) as e:
+        except _DAMAGED as e:
             raise InputError(f"{self._place}/{path}", "", f"is damaged ({e})", DAMAGE_FIX) from e
 
 
@@ -129,7 +134,7 @@ class StoreFiles:
             data = self.storage.get(key, MAX_DECODED_BYTES)
         else:
             start, size = (int(number) for number in self._index(key, array)[inner])
-            if start + size > 2**50 or size > MAX_DECODED_BYTES:
+            if start + size > 2**50 or not 0 < size <= MAX_DECODED_BYTES:
                 raise InputError(place, array.name, "its index names a chunk that cannot be", DAMAGE_FIX)
             data = self.storage.get_range(key, start, size)
         if data is None:

@@ -25,7 +25,7 @@ _KEPT_S = 3600.0
 _DEAD_AFTER = timedelta(days=1)  # a job on another machine without any sign of life
 _JOB = re.compile(r"jobs/([^./]+)\.json")
 _DRAFT = re.compile(r".+\.[0-9a-f]{16}\.part")
-_STORE = re.compile(r"(data(?:-[0-9]+)?\.zarr)(?:/|\.claim)")
+_STORE = re.compile(r"(data(?:-[0-9]+)?\.zarr)/")
 _PROBE = re.compile(r"\.probe-[0-9a-f]{16}(?:\.[0-9a-f]{16}\.part)?\Z")
 
 
@@ -81,24 +81,29 @@ def _clean_objects(run: Run, before_s: float, cleaned: Cleaned) -> None:
 
 
 def _clean_rest(storage: Storage, before_s: float, cleaned: Cleaned) -> None:
-    """Remove drafts, probes, and sealed stores that do not count."""
+    """Remove drafts, probes, and sealed stores that do not count and are not being written."""
     record = store_record(storage)
-    kept = record.name if record else ""
-    old = [
+    files = [file for file in storage.list("") if not file.key.startswith("parts/")]
+    newest_s: dict[str, float] = {}
+    for file in files:
+        newest_s[_store_of(file)] = max(newest_s.get(_store_of(file), 0.0), file.modified_s)
+    stores = {name for name, newest in newest_s.items() if name and newest < before_s}
+    stores -= {record.name} if record else set()
+    leftovers = (
         file
-        for file in storage.list("")
-        if file.modified_s < before_s and not file.key.startswith("parts/") and _is_garbage(file.key, kept)
-    ]
-    _remove(storage, old, cleaned)
-    for folder in sorted({found[1] for file in old if (found := _STORE.match(file.key))}):
-        storage.remove_empty(folder)
+        for file in files
+        if file.modified_s < before_s and (_PROBE.match(file.key) or _DRAFT.fullmatch(file.key))
+    )
+    _remove(storage, [file for file in files if _store_of(file) in stores], cleaned)
+    _remove(storage, [file for file in leftovers if _store_of(file) not in stores], cleaned)
+    for name in sorted(stores):
+        storage.remove_empty(name)
 
 
-def _is_garbage(key: str, kept: str) -> bool:
-    store = _STORE.match(key)
-    if store is not None:
-        return store[1] != kept
-    return any(kind.fullmatch(key) for kind in (_PROBE, _DRAFT))
+def _store_of(file: StoredFile) -> str:
+    """The sealed store that holds a file, or ""."""
+    found = _STORE.match(file.key)
+    return found[1] if found else ""
 
 
 def _remove(storage: Storage, files: list[StoredFile], cleaned: Cleaned) -> None:

@@ -18,8 +18,8 @@ from datagen.schemas.checking.finding import Finding, Reseal, Restore, SetAside,
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import SET_ASIDE, commit_key, object_key
 from datagen.schemas.run import Run, label_counts, open_runs
-from datagen.schemas.run_records import Commit, LedgerEntry, ShardRanges
-from datagen.schemas.sealing import remove_store, seal, store_record
+from datagen.schemas.run_records import Commit, LedgerEntry, ShardRanges, foreign_field
+from datagen.schemas.sealing import CLAIM, remove_store, seal, store_record
 from datagen.schemas.sealing.contents import RECORD, SEALED
 from datagen.schemas.storage import Storage
 
@@ -109,6 +109,8 @@ def _set_aside(storage: Storage, key: str, finding: Finding, into: str) -> None:
         _move(storage, [key], into)
         return
     commit = read(run.storage, commit_key(finding.shard), Commit).record
+    if commit is not None and foreign_field(run.manifest, finding.shard, commit):
+        commit = None  # the object that it names is not this shard's
     rows = f"{_prefix(storage, run)}{object_key(commit.attempt)}" if commit else ""
     _move(storage, [key, rows] if rows and storage.exists(rows) else [key], into)
     if commit is not None:
@@ -169,7 +171,10 @@ def _forget_store(storage: Storage, is_damaged: bool) -> None:
     """Remove a store that is damaged: an undamaged one is replaced once the new one is written."""
     if not is_damaged:
         return
+    record = None
     with suppress(InputError):  # its record is damaged
-        if (record := store_record(storage)) is not None:
-            remove_store(storage, record.name)
+        record = store_record(storage)
     storage.delete([RECORD])
+    if record is not None:
+        remove_store(storage, record.name)
+        storage.delete([f"{record.name}{CLAIM}"])  # no job runs: the next store may have its name

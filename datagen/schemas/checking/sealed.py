@@ -9,9 +9,9 @@ from datagen.schemas.checking.finding import Finding, Reseal, curable
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import ShardRanges
+from datagen.schemas.sealing import claimed_names
 from datagen.schemas.sealing.contents import (
     RECORD,
-    SEALED,
     SealedPart,
     StoreRecord,
     read_contents,
@@ -27,7 +27,7 @@ def read_store(storage: Storage) -> tuple[StoreRecord | None, list[Finding]]:
     except InputError as error:
         problem = f"{error.field}: {error.problem}" if error.field else error.problem
         return None, [curable(RECORD, "sealed", problem, Reseal())]
-    if record is None and storage.exists(f"{SEALED}/zarr.json"):
+    if record is None and any(storage.exists(f"{name}/zarr.json") for name in claimed_names(storage)):
         return None, [curable(RECORD, "sealed", "missing, but there is a store", Reseal())]
     return record, []
 

@@ -6,7 +6,7 @@ completed by running it again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from datagen.schemas.record_files import (
     MERGED,
     copy_key,
     encode_record,
+    end_key,
     object_key,
     publish,
     refuse_foreign,
@@ -142,35 +143,34 @@ def _write(part: Part, run: Run, tick: Tick) -> WrittenPart:
 
     def copy(one: tuple[Run, Commit]) -> None:
         source, commit = one
-        storage.put_new(object_key(commit.attempt), source.read_object(commit))
+        if not storage.put_new(key := object_key(commit.attempt), source.read_object(commit)):
+            problem = f"is another attempt of that name than in {source.storage.url}"
+            raise InputError(f"{storage.url}/{key}", "", problem, _ELSEWHERE)
         run.commit(commit)
 
     for _ in storage.concurrent_map(copy, new):
         tick()
     for source in part.runs:
         if identity(source) != identity(run):
-            _copy_records(source, run)
+            _copy_records(source, run, {end_key(commit.attempt) for _, commit in part.kept.values()})
     for source, commit in part.spare:
         if run.commit_of(commit.shard).attempt != commit.attempt:
             run.ledger.end(_end_of_spare(part.runs[source], commit))
     return WrittenPart(run, len(there), len(new), len(part.spare))
 
 
-def _copy_records(source: Run, run: Run) -> None:
-    """Copy the ledger, and the quarantine of shards that are not committed."""
+def _copy_records(source: Run, run: Run, but: Container[str]) -> None:
+    """Copy the ledger, but for some keys, and the quarantine of shards that are not committed."""
     there = {file.key for folder in ("ledger", "quarantine") for file in run.storage.list(folder)}
     keys = [file.key for file in source.storage.list("ledger") if file.key.endswith(".json")]
-    keys += [f"quarantine/{shard:06d}.json" for shard in sorted(source.quarantined() - run.committed())]
-    new = [key for key in sorted(keys) if key not in there]
-    pairs = source.storage.get_many(new, MAX_RECORD_BYTES)
+    keys += [f"quarantine/{shard:06d}.json" for shard in source.quarantined() - run.committed()]
+    new = [key for key in sorted(keys) if key not in there and key not in but]
 
     def put(pair: tuple[str, bytes | None]) -> None:
         if pair[1] is not None:
             run.storage.put_new(pair[0], pair[1])
 
-    for _ in (
-        map(put, pairs) if run.storage.folder is not None else run.storage.concurrent_map(put, list(pairs))
-    ):
+    for _ in run.storage.concurrent_map(put, source.storage.get_many(new, MAX_RECORD_BYTES)):
         pass
 
 

@@ -49,9 +49,7 @@ class Part:
     @property
     def scenes(self) -> ShardRanges:
         """The scenes of its committed shards."""
-        size = self.layout.scenes_per_shard
-        shards = ShardRanges.of(self.kept).ranges
-        return ShardRanges.between((first * size, past * size) for first, past in shards)
+        return ShardRanges.of(self.kept).times(self.layout.scenes_per_shard)
 
     @property
     def manifest(self) -> Manifest:
@@ -100,34 +98,37 @@ def largest_plan(parts: Iterable[Part]) -> Plan:
 def divide_scenes(parts: Sequence[Part]) -> list[MergedPart]:
     """Which scenes count in each part, in order of specification and falling size of shards.
 
-    A scene of several parts of one specification counts in the first that has it; scenes that no part has
-    belong to the first, which a resume extends. InputError where two parts have different rows for a scene.
+    A scene of several parts of one specification counts in the first that has it. Scenes that no part has
+    belong to the first, which a resume extends, unless others have scenes of the same shard: then to the
+    last, whose shards are the smallest. So those of each shard that count are consecutive. InputError where
+    two parts have different rows for a scene.
     """
     found: list[MergedPart] = []
     ordered = sorted(parts, key=lambda part: (part.key[0], -part.key[1]))
     for spec_hash in dict.fromkeys(part.key[0] for part in ordered):
         group = [part for part in ordered if part.key[0] == spec_hash]
-        taken, later = group[0].scenes, ShardRanges.of(())
-        extra: list[ShardRanges] = []
-        for number, part in enumerate(group[1:], 1):
-            _refuse_conflicts(group[:number], part, taken)
-            extra.append(part.scenes.without(taken))
-            taken, later = taken.union(part.scenes), later.union(extra[-1])
-        all_scenes = ShardRanges.between([(0, OPEN_END)])
-        for part, scenes in zip(group, [all_scenes.without(later), *extra], strict=True):
+        counted, taken = list[ShardRanges](), ShardRanges.of(())
+        for number, part in enumerate(group):
+            _refuse_conflicts(group[:number], part)
+            counted.append(part.scenes.without(taken))
+            taken = taken.union(part.scenes)
+        size = group[0].layout.scenes_per_shard
+        missing, begun = ShardRanges.between([(0, OPEN_END)]).without(taken), taken.blocks(size).times(size)
+        counted[0] = counted[0].union(missing.without(begun))
+        counted[-1] = counted[-1].union(missing.within(begun))
+        for part, scenes in zip(group, counted, strict=True):
             found.append(MergedPart(folder=part.folder, spec_hash=spec_hash, scenes=scenes.ranges))
     return found
 
 
-def _refuse_conflicts(before: Sequence[Part], part: Part, taken: ShardRanges) -> None:
-    """Compare the rows of scenes that a part has in common with those before it."""
-    size = part.layout.scenes_per_shard
-    for shard, (source, _) in part.kept.items():
-        for scene in ShardRanges.of(range(shard * size, (shard + 1) * size)).within(taken):
-            other = next(one for one in before if scene in one.scenes)
-            its = scene // other.layout.scenes_per_shard
-            if scene in (shard * size, its * other.layout.scenes_per_shard):  # a pair of shards once
-                refuse_different_rows(other.runs[other.kept[its][0]], its, part.runs[source], shard)
+def _refuse_conflicts(before: Sequence[Part], part: Part) -> None:
+    """Compare the rows of scenes that a part has in common with those before it, each pair of shards once."""
+    for other in before:
+        sizes = part.layout.scenes_per_shard, other.layout.scenes_per_shard
+        common = part.scenes.within(other.scenes)
+        for shard, its in sorted({(scene // sizes[0], scene // sizes[1]) for scene in common}):
+            runs = other.runs[other.kept[its][0]], part.runs[part.kept[shard][0]]
+            refuse_different_rows(runs[0], its, runs[1], shard)
 
 
 def refuse_incompatible(runs: Sequence[Run]) -> None:

@@ -11,12 +11,14 @@ import re
 import secrets
 import warnings
 from collections.abc import Callable, Iterator
-from itertools import chain, count
+from contextlib import suppress
+from itertools import chain, count, takewhile
 
 import zarr
 from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
+from datagen.schemas.errors import InputError
 from datagen.schemas.fields import TABLES
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.run_records import FileEntry
@@ -56,7 +58,12 @@ def seal(storage: Storage, tick: Tick = lambda done, total: None) -> str:
     if old is not None and (old.rows_sha256, old.parts) == (digest, parts):
         return f"{storage.url}/{old.name}"
     name = _claimed_name(storage, old)
-    files = tuple(_write(storage, name, contents, tick))
+    try:
+        files = tuple(_write(storage, name, contents, tick))
+    except BaseException:
+        with suppress(InputError):
+            remove_store(storage, name)
+        raise
     new = StoreRecord(name=name, rows_sha256=digest, parts=parts, files=files)
     storage.put(RECORD, encode_record(new))
     storage.sync([RECORD])
@@ -66,11 +73,22 @@ def seal(storage: Storage, tick: Tick = lambda done, total: None) -> str:
 
 
 def remove_store(storage: Storage, name: str) -> None:
-    """Remove a store and its claim, its root first, so that it is never readable in part."""
+    """Remove a store, its root first, so that it is never readable in part.
+
+    Its claim stays: a name that is used once cannot be written while another process removes its files.
+    """
     storage.delete([f"{name}/{_ROOT}"])
     storage.delete([file.key for file in storage.list(name)])
     storage.remove_empty(name)
-    storage.delete([f"{name}{CLAIM}"])
+
+
+def claimed_names(storage: Storage) -> list[str]:
+    """The names of all stores that were begun, in order."""
+    return list(takewhile(lambda name: storage.exists(f"{name}{CLAIM}"), map(_store_name, count(1))))
+
+
+def _store_name(number: int) -> str:
+    return SEALED if number == 1 else f"data-{number}.zarr"
 
 
 def _claimed_name(storage: Storage, old: StoreRecord | None) -> str:
@@ -78,7 +96,7 @@ def _claimed_name(storage: Storage, old: StoreRecord | None) -> str:
     before = _NUMBERED.fullmatch(old.name) if old else None
     first = int(before[1] or 1) + 1 if before else 1
     claim = secrets.token_bytes(8)  # its own bytes, so that another process's claim is not taken for it
-    names = (SEALED if number == 1 else f"data-{number}.zarr" for number in count(first))
+    names = map(_store_name, count(first))
     return next(name for name in names if storage.put_new(f"{name}{CLAIM}", claim))
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 import secrets
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -21,8 +21,6 @@ from datagen.schemas.storage.local_files import LocalFiles, StoredFile
 
 if TYPE_CHECKING:
     from datagen.schemas.storage.remote_objects import RemoteObjects
-from collections.abc import Generator
-from concurrent.futures import Future, wait
 
 __all__ = ["Storage", "StoredFile", "open_storage", "storage_error"]
 
@@ -65,11 +63,6 @@ class Storage:
     def put(self, key: str, data: bytes) -> None:
         """Write a file, or replace it. Not durable before `sync`."""
         self._try(key, lambda: self._files.put(key, data))
-
-    def put_many(self, files: Mapping[str, bytes]) -> None:
-        for key in files:
-            _checked(self.url, key)
-        _exhaust(self.concurrent_map(lambda item: self.put(*item), files.items()))
 
     def put_new(self, key: str, data: bytes) -> bool:
         """Write a file durably unless the key exists; False where it exists with other bytes.
@@ -222,17 +215,9 @@ def _checked(url: str, key: str) -> str:
     return key
 
 
-def _exhaust(results: Iterator[None]) -> None:
-    deque(results, maxlen=0)
-
-
 @cache
 def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="store")
-
-
-Result = TypeVar("Result")
-Item = TypeVar("Item")
 
 
 def concurrent_map(

@@ -119,9 +119,6 @@ def store_trouble(error: Exception) -> RequestFailure:
             return RequestFailure(f"the store responds {shown}", fix, is_transient=True)
         fix = "Check that AWS_ENDPOINT_URL is an S3 store that supports this request"
         return RequestFailure(f"the store refuses ({shown})", fix, is_transient=False)
-    if code:  # a copy that fails late responds 200 with an error in its body
-        fix = f"Wait until the store has recovered, {_RESUME}"
-        return RequestFailure(f"the store responds {code}", fix, is_transient=True)
     return _connection_failure(text)
 
 

@@ -110,7 +110,8 @@ class LocalFiles:
         except FileNotFoundError:
             return None
         with _closing(fd):
-            return os.pread(fd, size, start if start >= 0 else max(0, os.fstat(fd).st_size + start))
+            end = os.fstat(fd).st_size
+            return os.pread(fd, min(size, end), start if start >= 0 else max(0, end + start))
 
     def exists(self, key: str) -> bool:
         folders, name = _split(key)
