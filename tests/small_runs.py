@@ -12,6 +12,8 @@ import pytest
 import zarr
 
 from datagen import cli
+from datagen.schemas.sealing import store_record
+from datagen.schemas.storage import open_storage
 from tests.made_runs import files_of as files_of
 
 # Small frames, clouds and windows: everything a full run does, at a fraction of its time.
@@ -63,7 +65,9 @@ def make_small_run(out: Path, n: int, *more: str, **choices: Any) -> Path:
 
 def arrays_of(run: Path) -> dict[str, np.ndarray[Any, Any]]:
     """Every array of a sealed run, by name, read by zarr alone."""
-    group = zarr.open_group(run / "data.zarr", mode="r")
+    record = store_record(open_storage(run))
+    assert record is not None
+    group = zarr.open_group(run / record.name, mode="r")
     return {name: np.asarray(array[...]) for name, array in group.arrays()}
 
 

@@ -138,6 +138,9 @@ class Job:
         except BaseException as error:
             end, code = _end_of(error)
             recorder.end(end, code, " ".join(str(error).split())[:1000])
+            if isinstance(error, InputError) and not isinstance(error, _CannotContinue):
+                fix = f"{error.fix}. Then resume: {command_line(self.resume)}"
+                raise InputError(error.place, error.field, error.problem, fix) from error
             raise
         recorder.end(summary.end, result.exit_code, summary.cause, summary)
         return result

@@ -69,14 +69,14 @@ def _reseed(path: Path) -> None:
 
 
 def _lead_outside(path: Path) -> None:
-    _edit(path, lambda commit: commit["files"][0].update(path="../../secret"))
+    _edit(path, lambda commit: commit["object"].update(path="../../secret"))
 
 
 DAMAGE: list[tuple[str, str, Callable[[Path], None], list[str]]] = [
     ("manifest cut", "manifest.json", _cut, []),
     ("specification edited", "manifest.json", _reseed, ["spec_hash"]),
     ("commit cut", "commits/000000.json", _cut, []),
-    ("commit with a path that leaves the run", "commits/000000.json", _lead_outside, ["files.0.path"]),
+    ("commit with a path that leaves the run", "commits/000000.json", _lead_outside, ["object.path"]),
     (
         "commit of infinite cost", "commits/000000.json",
         lambda p: p.write_text(p.read_text().replace('"wall_s":', '"wall_s":1e999,"was":', 1)) and None, [],

@@ -88,26 +88,27 @@ def test_it_says_what_came_from_where_and_what_is_missing(tmp_path: Path, capsys
     command = ["merge", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(out)]
     assert cli.run(command) == 0
     told = " ".join(capsys.readouterr().out.split())
-    words = (f"merged: {out}", "labels 30 of 40; missing shards: 1", f"datagen resume {out}", "3 linked")
+    words = (f"merged: {out}", "labels 30 of 40; missing shards: 1", f"datagen resume {out}", "3 copied")
     for word in (*words, "1 duplicates", f"{tmp_path}/a: 2 shards, made on test", f"{tmp_path}/b: 1"):
         assert word in told, (word, told)
     make_run(tmp_path / "b", 40)
     assert cli.run(command) == 0
     told = " ".join(capsys.readouterr().out.split())
     assert "labels 40 of 40 worker time" in told, told
-    assert "3 merged before, 1 linked" in told
+    assert "3 merged before, 1 copied" in told
     assert "datagen resume" not in told
 
 
 def test_an_interrupted_merge_says_how_to_go_on(apart: Path, tmp_path: Path):
     """A real Ctrl-C at the first shard that is written."""
     program = (
-        "import os, signal, sys, datagen.schemas.merging.writing as w\n"
+        "import os, signal, sys\n"
         "from datagen import cli\n"
+        "from datagen.schemas.run import Run\n"
         # What a shell starts in the background ignores it.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "link = w._link\n"
-        "w._link = lambda *given: (link(*given), os.kill(os.getpid(), signal.SIGINT))[0]\n"
+        "commit = Run.commit\n"
+        "Run.commit = lambda *given: (commit(*given), os.kill(os.getpid(), signal.SIGINT))[0]\n"
         "sys.exit(cli.run(sys.argv[1:]))"
     )
     out = tmp_path / "out"

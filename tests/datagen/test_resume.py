@@ -18,7 +18,7 @@ from datagen.schemas.quarantine import lifted_records
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import Manifest
-from tests.made_runs import give_up
+from tests.made_runs import give_up, object_of
 from tests.refusals import refused
 from tests.small_runs import (
     HERE,
@@ -44,8 +44,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def lose(run: Path, *shards: int) -> None:
     """As if these shards had never been made."""
     for shard in shards:
+        object_of(run, shard).unlink()
         (run / f"commits/{shard:06d}.json").unlink()
-        shutil.rmtree(run / f"shards/{shard:06d}")
         for file in run.glob(f"ledger/{shard:06d}-*"):
             file.unlink()
 

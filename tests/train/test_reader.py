@@ -61,20 +61,15 @@ def test_every_bit_flip_of_an_object_is_detected_and_named(tmp_path: Path):
     whole = victim.read_bytes()
     reader = SampleReader([tmp_path], ALL, SAMPLES)
     list(reader.shards())  # from here on checksums inside the object guard the chunks
-    first = SampleReader([tmp_path], ALL, SAMPLES)
-    found = 0
-    for bit in rng.integers(0, 8 * len(whole), 100):
+    rows = whole.index(b"distance_m/c.0") + 100  # within a chunk that both read
+    for bit in [*rng.integers(0, 8 * len(whole), 60), 8 * rows]:
         data = bytearray(whole)
         data[bit // 8] ^= 1 << (bit % 8)
         victim.write_bytes(data)
         with pytest.raises(InputError, match=r"a-1\.zip: .*another sha256"):
-            list(first.shards())
-        try:
-            list(reader.shards())
-        except InputError as error:
-            assert error.place.startswith(str(victim))
-            found += 1
-    assert found > 50  # the others are in the zip's own headers
+            list(SampleReader([tmp_path], ALL, SAMPLES).shards())
+    with pytest.raises(InputError, match=r"a-1\.zip/distance_m/c\.0: "):
+        list(reader.shards())
     victim.write_bytes(whole)
     assert len(list(reader.shards())) == 2
 
@@ -121,6 +116,7 @@ def test_hostile_metadata_of_a_sealed_store_is_refused(tmp_path: Path):
         ('"sample"', '"samples"'),
         ('"shape": [\n    20\n', '"shape": [\n    1000000000000\n'),
         *((chunks, chunks.replace("10", size)) for size in ("1000000000", "0", "7")),
+        ('"end"', '"start"'),
     ]
     for old, new in changes:
         assert old in text

@@ -26,7 +26,7 @@ from datagen.schemas.storage import Storage
 # Restoring a record reveals what depends on it: commits, then shards, then the sealed store.
 _PASSES = 6
 # Kinds of findings that do not keep a run from being sealed.
-_HARMLESS = ("account", "sealed", "stale")
+_HARMLESS = ("account", "sealed", "stale", "lost")
 _MOST_BYTES = 2**31  # of a file that is set aside
 _CAUSE = "its shard was set aside by datagen verify --repair"
 
@@ -153,7 +153,8 @@ def _reseal(storage: Storage, result: Repaired) -> bool:
             else:
                 result.resealed = True
                 has_labels = label_counts(runs).labels > 0
-                _forget_store(storage, is_damaged=any(f.kind == "sealed" for f in result.left))
+                if not has_labels or any(f.kind == "sealed" for f in result.left):
+                    _forget_store(storage)
                 if has_labels:
                     seal(storage)
                 return result.checked.is_sealed or has_labels
@@ -167,10 +168,8 @@ def _reseal(storage: Storage, result: Repaired) -> bool:
     return False
 
 
-def _forget_store(storage: Storage, is_damaged: bool) -> None:
-    """Remove a store that is damaged: an undamaged one is replaced once the new one is written."""
-    if not is_damaged:
-        return
+def _forget_store(storage: Storage) -> None:
+    """Remove a damaged store: an undamaged one is replaced once the new one is written."""
     record = None
     with suppress(InputError):  # its record is damaged
         record = store_record(storage)

@@ -59,11 +59,8 @@ def check_store(storage: Storage, record: StoreRecord, runs: list[Run], is_sound
     if is_stale:
         lost = sum(len(_lost(run, part)) for run in runs if (part := record.part_of(run)))
         if lost:
-            problem, fix = (
-                f"has {lost} shards whose commits are missing",
-                "Make them again with `datagen resume`",
-            )
-            yield Finding(RECORD, "lost", problem, fix)
+            problem = f"has {lost} shards without a commit: `datagen resume` makes them again"
+            yield curable(RECORD, "lost", problem, Reseal())
         else:
             yield curable(
                 record.name, "stale", "is not of the committed shards; nothing is damaged", Reseal()
