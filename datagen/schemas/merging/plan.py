@@ -27,7 +27,7 @@ class Part:
     """The union of runs of one specification and layout.
 
     `kept` has the source (its index in `runs`) and the commit of every shard; `spare` those of duplicates,
-    which have equal rows.
+    which have equal rows and may be of one attempt.
     """
 
     runs: tuple[Run, ...]
@@ -81,7 +81,7 @@ def plan_part(runs: Sequence[Run], is_first_kept: bool, tick: Tick) -> Part:
             if commit.object.sha256 != best[1].object.sha256:
                 refuse_different_rows(runs[best[0]], shard, runs[source], shard)
         kept[shard] = best
-        spare += [other for other in rest if other[1].attempt != best[1].attempt]
+        spare += rest
     return Part(tuple(runs), kept, spare)
 
 
