@@ -1,17 +1,15 @@
-"""Digests of labels and of every stored byte of fresh runs, to compare two versions of the program.
+"""Digests of labels and of every stored row of fresh runs, to compare two versions of the program.
 
     python -m benchmarks.digests [--n 3000] [--assets DIR] [--checkout DIR] [--folder FOLDER]
 
 Makes `n` labels of each source and prints, for each, the sha256 of all sample ids with their labels, and of
-the paths and checksums of all files of all shards. Equal rows mean equal labels and equal bytes. `--checkout`
-makes the runs with another checkout's code; this one reads what it stores.
+all arrays of the sealed store, read by zarr alone. `--checkout` makes the runs with another checkout's code.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import os
 import subprocess
 import sys
@@ -39,7 +37,7 @@ def main() -> None:
     world: list[str] = []
     if options.assets is not None:
         world = ["--houses", f"procthor:{options.assets}/procthor", "--objects", f"ycb:{options.assets}/ycb"]
-    print(f"{'source':<10} {'labels':>6} {'positive':>8}  {'ids and labels':<16}  {'stored bytes':<16}")
+    print(f"{'source':<10} {'labels':>6} {'positive':>8}  {'ids and labels':<16}  {'all arrays':<16}")
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         for source, more in RUNS.items():
             run = Path(folder) / source
@@ -53,7 +51,7 @@ def main() -> None:
                 stderr=subprocess.DEVNULL,
             )
             n, positive, labels = digest_of_labels(run)
-            stored = digest_of_bytes(run)
+            stored = digest_of_rows(run)
             print(f"{source:<10} {n:>6,} {positive:>8,}  {labels:<16}  {stored:<16}", flush=True)
 
 
@@ -65,13 +63,14 @@ def digest_of_labels(run: Path) -> tuple[int, int, str]:
     return len(labels), int((labels == 1).sum()), digest[:16]
 
 
-def digest_of_bytes(run: Path) -> str:
-    """A digest of paths and checksums of all files of all shards."""
-    digest = hashlib.sha256()
-    for commit in sorted(run.glob("commits/*.json")):
-        record = json.loads(commit.read_text())
-        files = sorted((file["path"], file["sha256"]) for file in record["files"])
-        digest.update(json.dumps([record["shard"], files]).encode())
+def digest_of_rows(run: Path) -> str:
+    """Digest over name, type, shape and values of every array of the sealed store."""
+    group, digest = zarr.open_group(run / "data.zarr", mode="r"), hashlib.sha256()
+    for name in sorted(group.array_keys()):
+        values = np.asarray(group[name][...])
+        text = values.dtype.kind in "OTU"
+        data = "\0".join(values.astype(object).ravel().tolist()).encode() if text else values.tobytes()
+        digest.update(f"{name} {'text' if text else values.dtype.str} {values.shape}".encode() + data)
     return digest.hexdigest()[:16]
 
 

@@ -12,6 +12,7 @@ import argparse
 import os
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from datagen.cluster.driver import AttemptOrder, drive
@@ -19,6 +20,8 @@ from datagen.cluster.protocol import AttemptReport, StopRequest
 from datagen.cluster.run_recorder import RunRecorder
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.configuration.specify import layout_of
+from datagen.reports.audit import audit_runs
+from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost
@@ -29,6 +32,7 @@ from tests.s3_servers import Faults, environment, faulty_proxy, make_bucket, mot
 
 _TINY = 40  # shards
 _DRIVEN = 2000
+_MANY = 500
 
 
 class Ended:
@@ -76,6 +80,23 @@ def tiny_shard_s(folder: Path) -> float:
     return (time.perf_counter() - start_s) / _TINY
 
 
+def cpu_per_shard(folder: Path) -> dict[str, float]:
+    """CPU milliseconds of a tiny shard by what a run's whole is read for."""
+    run = make_run(folder, n=10 * _MANY)
+    works: dict[str, Callable[[], object]] = {
+        "commit read": lambda: sum(1 for _ in run.commits()),
+        "seal": lambda: seal(run.storage),
+        "audit": lambda: audit_runs([run]),
+        "verify": lambda: list(check_runs(run.storage, Checked())),
+    }
+    found: dict[str, float] = {}
+    for name, work in works.items():
+        start_s = time.process_time()
+        work()
+        found[name] = 1e3 * (time.process_time() - start_s) / _MANY
+    return found
+
+
 def on_s3(latency_s: float) -> tuple[float, float]:
     """(requests of a shard with its share of the seal, shards that a driver ends a second)."""
     faults = Faults(delay_s=latency_s)
@@ -120,6 +141,8 @@ def main() -> None:
         merge_runs(plan_merge([small.storage.url, large.storage.url], str(root / "merged")))
         merged_s = time.perf_counter() - start_s
         _row("merge of 600 and 9,000 labels", f"{merged_s:.2f} s", f"{files_below(root / 'merged')[0]} files")
+        for name, cpu_ms in cpu_per_shard(root / "many").items():
+            _row(f"{name}, a tiny shard", f"{cpu_ms:.2f} ms", "of CPU")
     requests, rate = on_s3(options.latency_s)
     _row("requests a shard, seal included", f"{requests:.1f}")
     _row(f"shards a driver ends, S3 at {1e3 * options.latency_s:g} ms", f"{rate:,.0f}/s")
