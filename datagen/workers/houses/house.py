@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 from datagen.workers.geometry.mesh import F32, F64, Mesh
@@ -64,6 +65,8 @@ class House:
     rooms: tuple[Room, ...]
     bodies: tuple[StaticBody, ...]
     surfaces: tuple[Surface, ...]
+    # Things that are left out or implausible, counted by cause.
+    findings: Mapping[str, int] = field(default_factory=dict)
 
     def room(self, room_id: str) -> Room:
         return next(r for r in self.rooms if r.room_id == room_id)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,8 +15,8 @@ from datagen.workers.furniture.assets import Asset, read_asset_table
 from datagen.workers.furniture.solids import hash_bytes
 from datagen.workers.houses.house import House
 from datagen.workers.houses.line_index import MAX_LINES, Line, LineIndex, open_lines
-from datagen.workers.houses.loader import build_house
-from datagen.workers.json_document import parse_json
+from datagen.workers.houses.loader import build_house, read_house
+from datagen.workers.json_document import JsonNode, parse_json
 
 _MAX_FILES = 100_000
 _Place = tuple[LineIndex, Line]
@@ -38,14 +39,22 @@ class ProcthorHouses:
 
     def load(self, house_id: str) -> House:
         """The house. Raises InputError that names the file, its line, the house and the JSON path."""
+        document, digest = self.document(house_id)
+        return build_house(document, house_id, digest, self.assets)
+
+    def examine(self, house_id: str) -> Mapping[str, int]:
+        """The findings of the house, without building it. Raises InputError as `load` does."""
+        return read_house(self.document(house_id)[0], self.assets).findings
+
+    def document(self, house_id: str) -> tuple[JsonNode, str]:
+        """The parsed document of a house, and the sha256 of its bytes. Raises InputError that names it."""
         if house_id not in self.places:
             raise InputError(self.folder, "", f"has no house {house_id!r}", "Give one of its ids.")
         if house_id in self.clashes:
             fix = "Rename or remove one of them."
             raise InputError(self.folder, house_id, f"two houses: {self.clashes[house_id]}", fix)
         index, line = self.places[house_id]
-        document = parse_json(index.text(line), f"{index.path}:{line.number} ({house_id})")
-        return build_house(document, house_id, line.sha256, self.assets)
+        return parse_json(index.text(line), f"{index.path}:{line.number} ({house_id})"), line.sha256
 
 
 def open_procthor(folder: str) -> ProcthorHouses:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
 from datagen.workers.furniture.assets import Asset
-from datagen.workers.houses import loader, open_houses
+from datagen.workers.houses import open_houses, things
 from datagen.workers.houses.loader import build_house
 from datagen.workers.json_document import JsonNode
 from tests.workers.houses.house_files import SIZES, thing, two_rooms, write_houses, xyz
@@ -173,7 +173,7 @@ def test_two_different_houses_with_one_id_are_refused_by_that_id(tmp_path: Path)
 
 
 def test_a_house_of_more_things_than_memory_would_bear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(loader, "MAX_BODIES", 50)
+    monkeypatch.setattr(things, "MAX_BODIES", 50)
     document = two_rooms()
     document["objects"] = [thing(f"0|{k}", "Mug_1", xyz(1, 0.05, 1)) for k in range(60)]
     source = open_houses(f"procthor:{write_houses(tmp_path, [document])}")

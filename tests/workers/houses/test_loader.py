@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.houses import open_houses
 from datagen.workers.houses.house import House
-from datagen.workers.houses.loader import unity_rotation
+from datagen.workers.houses.things import unity_rotation
 from datagen.workers.houses.walls_and_floors import clean_polygon, triangles
 from tests.workers.houses.house_checks import check_house, covers, top_below_m
 from tests.workers.houses.house_files import thing, two_rooms, wall, write_houses, xyz
@@ -253,3 +253,13 @@ def test_rooms_with_right_angles_and_repeated_corners(seed: int):
     assert not isinstance(cleaned, str)
     assert len(cleaned) == 6
     assert np.isclose(sum(area(cleaned[list(t)]) for t in triangles(cleaned)), (a + b) * c + a * d)
+
+
+def test_things_outside_every_room_carry_nothing(tmp_path: Path):
+    document = two_rooms()
+    document["objects"] = [
+        thing("out", "Table_1", xyz(20, 0.375, 2.0)),
+        *(thing(f"chair {k}", "Chair_1", xyz(0.5 + 0.5 * k, 0.45, 1.0)) for k in range(8)),
+    ]
+    house = load(tmp_path, document)
+    assert not house.surfaces and house.findings == {"implausible (outside its room)": 1}
