@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -42,6 +43,7 @@ from datagen.workers.houses import open_houses
 from datagen.workers.labels import load_label_source
 from datagen.workers.objects import open_objects
 from datagen.workers.scenes.generate import generate_scene
+from datagen.workers.survey import Survey, counts_of, survey_sources
 from datagen.workers.world import World, assemble_world, open_world
 
 # Options that --scenes-from decides.
@@ -119,7 +121,7 @@ class SubmitOptions(JobOptions):
     ] = None
     dry_run: Annotated[
         bool,
-        option("Check everything, make nothing; print shards, scenes and the command.", RUNNING),
+        option("Check everything, make nothing; print shards, scenes, unusable houses and objects.", RUNNING),
     ] = False
 
 
@@ -165,7 +167,9 @@ def submit(options: SubmitOptions) -> JobResult:
         return detach_job(words, path, options)
     with options.display() as shown:
         shown.phase("opening houses and objects")
-        run, manifest = _specified(options)
+        run, manifest, surveys = _specified(options, shown)
+    if not options.quiet:
+        _report(surveys, options)
     if options.houses is None and options.scenes_from is None and not options.quiet:
         Progress(options.json).say("note", {"note": _BUILTIN}, _BUILTIN)
     if options.dry_run:
@@ -182,14 +186,15 @@ def submit(options: SubmitOptions) -> JobResult:
     return Job(run.storage, path, [job_run], options, began_s, words, again).run()
 
 
-def _specified(options: SubmitOptions) -> tuple[Run | None, Manifest]:
-    """The run at `out`, None where there is none yet, and the manifest of the options.
+def _specified(options: SubmitOptions, shown: Progress) -> tuple[Run | None, Manifest, Mapping[str, Survey]]:
+    """The run at `out`, None where there is none yet, the manifest of the options, and what was left out.
 
     InputError where they differ and, before anything is written, where no scene can be made.
     """
     run, label_source = _existing_run(str(options.out)), options.label_source
     config = None if options.config is None else Path(options.config)
     chosen = options.robot, options.perturb
+    surveys: Mapping[str, Survey] = {}
     if options.scenes_from is None:
         houses, objects = options.houses or "builtin", options.objects or "builtin"
         house_source, object_source = open_houses(houses), open_objects(objects)
@@ -199,7 +204,9 @@ def _specified(options: SubmitOptions) -> tuple[Run | None, Manifest]:
         refuse_unusable_engines(spec, options.address)
         if run is None:
             _refuse_no_scene(world, houses)
-        layout, stored_in = layout_of(spec, options.n), {}
+        surveys = survey_sources(house_source, object_source, shown.counter("houses examined"))
+        layout = layout_of(spec, options.n)
+        stored_in = counts_of(world.house_ids, world.object_names, surveys)
     else:
         given = given_options(options)
         stored = open_stored_scenes(
@@ -214,17 +221,28 @@ def _specified(options: SubmitOptions) -> tuple[Run | None, Manifest]:
         refuse_unusable_engines(spec, options.address)
         layout = layout_again(spec, stored, options.n) if run is None else run.layout
         refuse_too_few(stored, layout, options.n)
-        stored_in = {"scenes_from": stored.run.storage.url}
-    sources = {
-        "houses": absolute_source(houses),
-        "objects": absolute_source(objects),
-        "n_houses": str(len(world.house_ids)),
-        "n_objects": str(len(world.object_names)),
-    }
-    manifest = manifest_of(spec, layout, sources | stored_in)
+        known = stored.run.manifest.sources
+        stored_in = {**known, "scenes_from": stored.run.storage.url}
+    sources = {"houses": absolute_source(houses), "objects": absolute_source(objects)}
+    manifest = manifest_of(spec, layout, stored_in | sources)
     if run is not None:
         refuse_other(run.storage.url, run.manifest, manifest)
-    return run, manifest
+    return run, manifest, surveys
+
+
+def _report(surveys: Mapping[str, Survey], options: SubmitOptions) -> None:
+    """Print a line for each source with files; a dry run also prints each unusable house and object."""
+    progress = Progress(options.json)
+    for what, survey in surveys.items():
+        source = f"{str(getattr(options, what)).partition(':')[0]} {what}"
+        reasons = survey.unusable if options.dry_run else {}
+        counts = {"read": survey.read, "unusable": survey.causes, "findings": survey.findings}
+        lines = [f"{source}: {survey}", *(f"  {name}: {reason}" for name, reason in reasons.items())]
+        if options.json:
+            progress.say("source", {"source": source, **counts, "reasons": reasons}, "")
+        else:
+            for line in lines:
+                progress.say("", {}, line)
 
 
 def _dry_run(path: str, run: Run | None, manifest: Manifest, n: int, words: list[str]) -> JobResult:

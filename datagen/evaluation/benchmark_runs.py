@@ -18,6 +18,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Manifest
 from datagen.schemas.storage import open_storage
+from datagen.workers.survey import counts_of, survey_sources
 from datagen.workers.world import open_world
 
 
@@ -56,7 +57,8 @@ def make_runs(
         for name, wanted in runs.items():
             refuse_other_engines(f"benchmark run {name}", wanted.spec)
             world = open_world(wanted.spec, houses, objects[wanted.objects])
-            counts = {"n_houses": str(len(world.house_ids)), "n_objects": str(len(world.object_names))}
+            surveys = survey_sources(world.houses, world.objects, shown.counter("houses examined"))
+            counts = counts_of(world.house_ids, world.object_names, surveys)
             sources = {"houses": houses, "objects": objects[wanted.objects], **counts}
             manifests[name] = manifest_of(wanted.spec, layout_of(wanted.spec, wanted.n), sources)
     for name, wanted in runs.items():

@@ -48,18 +48,18 @@ EXCLUDED: dict[str, Exclusion] = {
 
 
 def reason_to_exclude(name: str, mass_kg: float, volume_m3: float, mass_is_measured: bool) -> str | None:
-    """The reason why the object cannot be used, or None.
+    """The reason why the object cannot be used, `cause: detail`, or None.
 
     `mass_is_measured` is False if the mass was derived from a density; rows about wrong published
     masses then do not apply.
     """
     row = EXCLUDED.get(name)
     if row is not None and (mass_is_measured or not row.mass_only):
-        return row.reason
+        return f"{'wrong mass' if row.mass_only else 'wrong shape'}: {row.reason}"
     density = mass_kg / volume_m3
     if not MIN_DENSITY_KG_M3 <= density <= MAX_DENSITY_KG_M3:
         return (
-            f"{mass_kg:g} kg over {volume_m3 * 1e6:.3g} cm3 is {density:.3g} kg/m3, "
+            f"wrong density: {mass_kg:g} kg over {volume_m3 * 1e6:.3g} cm3 is {density:.3g} kg/m3, "
             f"outside {MIN_DENSITY_KG_M3:g} to {MAX_DENSITY_KG_M3:g}"
         )
     return None

@@ -28,7 +28,7 @@ class ObjectModel:
 
 
 class ObjectSource(Protocol):
-    """A named set of objects. `excluded` maps excluded objects to the reasons."""
+    """A named set of objects. `excluded` maps excluded objects to reasons, `cause: detail`."""
 
     kind: str
     digest: str  # digest of the content, not of the path
