@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections import OrderedDict
+from collections import Counter, OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, cast
@@ -28,6 +29,12 @@ from datagen.workers.furniture.assets import CARRYING_TYPES
 from datagen.workers.geometry.mesh import F32, F64, Mesh
 from datagen.workers.geometry.transforms import rotation_of
 from datagen.workers.houses.glb import MAX_FILE_BYTES, read_glb
+from datagen.workers.houses.habitat_checks import (
+    is_about_centre,
+    refuse_unfit_size,
+    refuse_unfit_stage,
+    refuse_upside_down,
+)
 from datagen.workers.houses.house import House, Room, StaticBody, Surface
 from datagen.workers.houses.loader import room_ids_at
 from datagen.workers.houses.mesh_geometry import (
@@ -91,28 +98,24 @@ class Ai2thorHouses:
 
     def load(self, house_id: str) -> House:
         """The house. Raises InputError that names the file and the field."""
-        if house_id not in self.scenes:
-            raise InputError(self.root, "", f"has no house {house_id!r}", "Give the id of one of its houses.")
-        path = self.scenes[house_id]
-        text = read_regular(path, _MAX_SCENE_BYTES, _FIX)
-        scene = parse_json(text, str(path))
+        scene, text = self._scene(house_id)
         digest = hashlib.sha256(text)
         stage = self._template(self.root / _STAGES / f"{_template_name(scene.get('stage_instance'))}.glb")
         digest.update(stage.digest)
         turn = _PROCTHOR_STAGE if house_id.startswith("ProcTHOR/") else np.eye(4)
         mesh = _without_ceiling(stage.mesh.transformed(_in_world(turn)))
-        if not len(mesh.faces):
-            raise scene.get("stage_instance").error("has neither walls nor floor", _FIX)
+        refuse_unfit_stage(scene.get("stage_instance"), mesh)
         placed: list[tuple[StaticBody, F64, F64, Mesh]] = []
-        for number, entry in enumerate(scene.get("object_instances").items(_MAX_OBJECTS)):
-            name = _template_name(entry)
-            file = self.root / _OBJECTS / f"{name}.glb"
-            if not file.is_file():
-                continue
-            template = self._template(file)
+        instances, findings = self._instances(scene)
+        for number, name, entry, T_world in instances:
+            template = self._template(self.root / _OBJECTS / f"{name}.glb")
             digest.update(template.digest)
-            T_world = _pose(entry)
+            if is_about_centre(entry, scene):
+                centre_m = self._centre_m(name, template)
+                T_world[:3, 3] -= T_world[:3, :3] @ centre_m
+                digest.update(centre_m.tobytes())
             placed.append(self._placed(number, name, template, T_world))
+            refuse_unfit_size(entry, placed[-1][0].visual)
             digest.update(placed[-1][0].object_type.encode())  # the type decides on support surfaces
         bodies, rooms = _walls_and_rooms(mesh, [(b, xy) for b, xy, _, _ in placed])
         owners = room_ids_at(np.array([xy for _, xy, _, _ in placed]).reshape(-1, 2), rooms)
@@ -121,7 +124,43 @@ class Ai2thorHouses:
             bodies.append(replace(body, room_id=owner))
             if owner and body.object_type in CARRYING_TYPES:
                 surfaces.extend(_surfaces(body, owner, T, local))
-        return House(house_id, digest.hexdigest(), tuple(rooms), tuple(bodies), tuple(surfaces))
+        return House(house_id, digest.hexdigest(), tuple(rooms), tuple(bodies), tuple(surfaces), findings)
+
+    def examine(self, house_id: str) -> Mapping[str, int]:
+        """The findings of the house. Raises InputError as `load` does, but for meshes, which it does not read."""
+        return self._instances(self._scene(house_id)[0])[1]
+
+    def _scene(self, house_id: str) -> tuple[JsonNode, bytes]:
+        if house_id not in self.scenes:
+            raise InputError(self.root, "", f"has no house {house_id!r}", "Give the id of one of its houses.")
+        text = read_regular(self.scenes[house_id], _MAX_SCENE_BYTES, _FIX)
+        return parse_json(text, str(self.scenes[house_id])), text
+
+    def _instances(self, scene: JsonNode) -> tuple[list[tuple[int, str, JsonNode, F64]], Counter[str]]:
+        """(number, template, entry, `T_world_object`) of the objects whose meshes exist, and the findings."""
+        found: list[tuple[int, str, JsonNode, F64]] = []
+        findings = Counter[str]()
+        for number, entry in enumerate(scene.get("object_instances").items(_MAX_OBJECTS)):
+            name = _template_name(entry)
+            if (self.root / _OBJECTS / f"{name}.glb").is_file():
+                found.append((number, name, entry, _pose(entry)))
+            else:
+                findings["missing meshes"] += 1
+        refuse_upside_down(scene, [T for *_, T in found], findings)
+        return found, findings
+
+    def _centre_m(self, name: str, template: _Template) -> F64:
+        """The point (3,) of a template, z up, that a scene may place: its configured centre of mass, or the
+        centre of its bounding box."""
+        config = self._config(name)
+        centre = None if config is None else config.find("COM")
+        if centre is not None:
+            return _Y_UP_TO_WORLD[:3, :3] @ _numbers(centre, 3, EXTENT_M)
+        return (template.mesh.vertices_m.min(0) + template.mesh.vertices_m.max(0)).astype(np.float64) / 2
+
+    def _config(self, name: str) -> JsonNode | None:
+        path = self.root / _CONFIGS / f"{name}.object_config.json"
+        return parse_json(read_regular(path, 1 << 20, _FIX), str(path)) if path.is_file() else None
 
     def _template(self, file: Path) -> _Template:
         if file in self._templates:
@@ -154,13 +193,12 @@ class Ai2thorHouses:
 
     def _type_of(self, name: str) -> str:
         """The object type by the semantic id of the template's configuration, else by its name."""
-        config = self.root / _CONFIGS / f"{name}.object_config.json"
-        if config.is_file():
-            found = parse_json(read_regular(config, 1 << 20, _FIX), str(config)).find("semantic_id")
-            if found is not None:
-                known = self.types.get(int(found.number(-1, 1e9)))
-                if known is not None:
-                    return known
+        config = self._config(name)
+        found = None if config is None else config.find("semantic_id")
+        if found is not None:
+            known = self.types.get(int(found.number(-1, 1e9)))
+            if known is not None:
+                return known
         letters = "".join(c for c in PurePosixPath(name).name if c.isalpha()).lower()
         known_types = sorted(CARRYING_TYPES, key=lambda t: -len(t))
         return next((t for t in known_types if t.lower() in letters), "Object")
@@ -307,9 +345,6 @@ def _surfaces(body: StaticBody, room_id: str, T: F64, local: Mesh) -> list[Surfa
     for k, (height, rectangle) in enumerate(flat_tops(local, low, high)):
         T_surface = T.copy()
         T_surface[:3, 3] = T[:3, :3] @ (*rectangle.centre_m, height) + T[:3, 3]
-        out.append(
-            Surface(
-                f"{body.body_id}/{k}", body.body_id, body.object_type, room_id, T_surface, rectangle.size_m
-            )
-        )
+        body_id, size_m = body.body_id, rectangle.size_m
+        out.append(Surface(f"{body_id}/{k}", body_id, body.object_type, room_id, T_surface, size_m))
     return out

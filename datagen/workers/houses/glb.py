@@ -20,6 +20,7 @@ MAX_FACES = 500_000
 _MAX_COUNT = 10_000_000  # positions, normals, colours and indices of MAX_FACES loose triangles are fewer
 _MAX_JSON_BYTES = 16 << 20
 _MAX_TEXTURE_PX = 64_000_000
+_FARTHEST = 1e6  # a scene may scale millimetres
 _PLAIN = (180, 178, 174)
 _FIX = "Download the asset again, or remove the scenes that use it."
 # Exceptions of trimesh, which checks little itself, for damaged files: dangling references, values of wrong
@@ -89,8 +90,8 @@ def _merged(pieces: list[Any]) -> Mesh:
         colours.append(_face_rgb(piece))
         offset += len(piece.vertices)
     points = np.concatenate(vertices)
-    if not np.isfinite(points).all() or np.abs(points).max() > 1000.0:
-        raise ValueError("coordinates that are not finite or beyond 1000 m")
+    if not np.isfinite(points).all() or np.abs(points).max() > _FARTHEST:
+        raise ValueError("coordinates that are not finite or too large")
     keys, inverse = np.unique(np.round(points / 1e-5).astype(np.int64), axis=0, return_inverse=True)
     indices = inverse.reshape(-1)[np.concatenate(faces)]
     keep = (

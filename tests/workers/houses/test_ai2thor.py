@@ -268,3 +268,97 @@ def test_folders_without_scenes(tmp_path: Path):
         open_houses(f"ai2thor:{tmp_path}")
     with pytest.raises(InputError):
         open_houses("ai2thor:")
+
+
+def edit(root: Path, **more: object) -> dict:
+    """The scene of `root` with other members."""
+    scene = json.loads(scene_file(root).read_text()) | more
+    scene_file(root).write_text(json.dumps(scene))
+    return scene
+
+
+@pytest.mark.parametrize("where", ["scene", "instance", "configured"])
+def test_translations_of_the_centre_of_mass_place_it(root: Path, where: str):
+    plain = root / "ai2thor/ai2thorhab-uncompressed"
+    export(plain / "assets/objects/Bed_1.glb", [box((1.4, 0.5, 2.0), (0.1, 0.25, 0), (90, 90, 140))])
+    things = [
+        instance("Bed_1", (2.0, 0.74, 1.2), (HALF, 0, HALF, 0), non_uniform_scale=[1, 2, 1]),
+        instance("Mug_1", (2.0, 1.0, 1.2)),
+    ]
+    if where == "instance":
+        things[0]["translation_origin"] = "com"
+        edit(root, object_instances=things, translation_origin="asset_local")
+    else:
+        edit(root, object_instances=things, translation_origin="COM")
+    lifted_m = 0.24  # the centre is half a metre above the base at twice its height
+    if where == "configured":
+        config = plain / "configs/objects/Bed_1.object_config.json"
+        config.write_text(json.dumps({"semantic_id": 4, "COM": [0.1, 0.3, 0.0]}))
+        lifted_m = 0.14
+    vertices = load(root).bodies[1].visual.vertices_m
+    np.testing.assert_allclose(
+        [vertices[:, 2].min(), vertices[:, 2].max()], [lifted_m, lifted_m + 1], atol=1e-5
+    )
+    np.testing.assert_allclose((vertices.min(0) + vertices.max(0))[:2] / 2, [2.0, -1.2], atol=1e-5)
+
+
+def test_an_unknown_origin_of_translations_is_named(root: Path):
+    edit(root, translation_origin="corner")
+    with pytest.raises(InputError, match=r"\$\.translation_origin: unknown origin 'corner'.*asset_local"):
+        load(root)
+
+
+@pytest.mark.parametrize("height_m", [-0.3, 0.2])
+def test_a_stage_whose_floor_is_not_at_zero_is_refused(root: Path, height_m: float):
+    stage = [box((8, 2.5, 0.1), (4, 1.25, -0.05), (230, 230, 220)), floor_at(height_m)]
+    export(root / "ai2thor/ai2thor-hab/assets/stages/iTHOR/home.glb", stage)
+    with pytest.raises(InputError, match=rf"stage_instance: another floor: .* {height_m:g} m"):
+        load(root)
+
+
+def test_meshes_in_millimetres_are_refused_unless_the_scene_scales_them(root: Path):
+    mug = root / "ai2thor/ai2thorhab-uncompressed/assets/objects/Mug_1.glb"
+    bed = mug.with_name("Bed_1.glb")
+    export(mug, [box((100, 100, 100), (0, 0, 0), (9, 9, 9))])
+    export(bed, [box((1400, 500, 2000), (0, 0, 0), (9, 9, 9))])
+    for number, span in ((2, "100"), (1, "2000")):
+        with pytest.raises(InputError, match=rf"wrong unit: the object spans {span} m"):
+            edit(
+                root, object_instances=[json.loads(scene_file(root).read_text())["object_instances"][number]]
+            )
+            load(root)
+        edit(root, object_instances=[instance("Mug_1", (2, 1, 1)), instance("Bed_1", (6, 1, 1))])
+    scaled = [
+        instance("Mug_1", (2, 1, 1), uniform_scale=1e-3),
+        instance("Bed_1", (6, 1, 1), uniform_scale=1e-3),
+    ]
+    edit(root, object_instances=scaled)
+    np.testing.assert_allclose(
+        np.ptp(load(root).bodies[2].visual.vertices_m, axis=0), [1.4, 2.0, 0.5], rtol=1e-4
+    )
+
+
+def test_a_stage_in_millimetres_is_refused(root: Path):
+    stage = [floor(0, 8000, 0, 3000, (1, 2, 3)), box((8000, 2500, 100), (4000, 1250, -50), (230, 230, 220))]
+    export(root / "ai2thor/ai2thor-hab/assets/stages/iTHOR/home.glb", stage)
+    with pytest.raises(InputError, match="wrong unit: the stage spans 8000 m"):
+        load(root)
+
+
+def test_rotations_of_another_order_are_refused(root: Path):
+    things = edit(root)["object_instances"]
+    for thing in things:
+        w, x, y, z = thing["rotation"]
+        thing["rotation"] = [x, y, z, w]
+    edit(root, object_instances=things)
+    with pytest.raises(InputError, match=r"implausible: 3 of 3 objects stand upside down.*w, x, y, z"):
+        load(root)
+
+
+def test_missing_meshes_and_fallen_things_are_counted_without_meshes(root: Path):
+    things = edit(root)["object_instances"]
+    things[2]["rotation"] = [0, 1, 0, 0]
+    edit(root, object_instances=things)
+    source = open_houses(f"ai2thor:{root}")
+    assert source.load("iTHOR/home").findings == {"missing meshes": 1, "implausible (upside down)": 1}
+    assert source.examine("iTHOR/home") == source.load("iTHOR/home").findings  # type: ignore[attr-defined]
