@@ -64,10 +64,12 @@ def make_run(
     candidates_per_scene: int = 5,
     shards: Iterable[int] | None = None,
     spec: Specification | None = None,
+    sources: dict[str, str] | None = None,
 ) -> Run:
     """A run of n samples with the given shards committed in the given order (default: all)."""
     layout = Layout(scenes_per_shard=scenes_per_shard, candidates_per_scene=candidates_per_scene)
-    run = Run.create_or_open(open_storage(folder), manifest_of(spec or small_spec(), layout), n)
+    manifest = manifest_of(spec or small_spec(), layout).model_copy(update={"sources": sources or {}})
+    run = Run.create_or_open(open_storage(folder), manifest, n)
     for shard in run.missing() if shards is None else shards:
         assert attempt(run, shard, f"a-{shard}")
     return run

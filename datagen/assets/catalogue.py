@@ -16,6 +16,12 @@ _GB = 10**9
 _PROCTHOR_10K = "439193522244720b86d8c81cde2e51e3a4d150cf"
 _PROCTHOR = "53d5bd4c8c96a699e6a615dc390abb670cc9d353"
 _YCB_SCANS = "https://ycb-benchmarks.s3.amazonaws.com/data/google"
+_DEITKE = "Deitke et al., ProcTHOR: Large-Scale Embodied AI Using Procedural Generation, arXiv:2206.06994"
+_KOLVE = "Kolve et al., AI2-THOR: An Interactive 3D Environment for Visual AI, 2017, arXiv:1712.05474"
+_CALLI = (
+    "Calli et al., Benchmarking in Manipulation Research: Using the Yale-CMU-Berkeley Object and Model Set, "
+    "2015, doi:10.1109/MRA.2015.2448951"
+)
 _MANISKILL = "https://huggingface.co/datasets/haosulab"
 
 
@@ -32,6 +38,9 @@ class CatalogueEntry:
     sha256: str | None = None
     size: int | None = None
     archive: bool = False
+    title: str = ""  # with `attribution` and `licence`, what the folder `holds` states of itself
+    attribution: str = ""
+    holds: str = ""  # subfolder of the target; "" for `into`
     max_bytes: int = _GB
     max_unpacked_bytes: int = 10 * _GB
 
@@ -44,6 +53,8 @@ def _houses(split: str, sha256: str, size: int) -> CatalogueEntry:
         licence="Apache-2.0",
         into="procthor",
         about=f"ProcTHOR-10K houses, {split} split",
+        title="ProcTHOR houses",
+        attribution=_DEITKE,
         sha256=sha256,
         size=size,
     )
@@ -72,6 +83,9 @@ _ALL = (
         licence="CC-BY-4.0",
         into="",
         about="YCB objects with convex parts, from ManiSkill; use: --objects ycb:DIR/mani_skill2_ycb",
+        title="YCB objects",
+        attribution=_CALLI,
+        holds="mani_skill2_ycb",
         sha256="1551724fd1ac7bad9807ebcf46dd4a788caed5c9499c1225b9bfa080ffbefcb3",
         archive=True,
         max_bytes=4 * _GB,
@@ -94,6 +108,9 @@ _ALL = (
         licence="Apache-2.0",
         into="",
         about="AI2-THOR scenes and furniture meshes, from ManiSkill; use: --houses ai2thor:DIR/ai2thor",
+        title="AI2-THOR scenes",
+        attribution=_KOLVE,
+        holds="ai2thor",
         archive=True,
         max_bytes=60 * _GB,
         max_unpacked_bytes=200 * _GB,
@@ -106,6 +123,8 @@ _ALL = (
             licence="CC-BY-4.0",
             into="ycb-scans",
             about="YCB laser scan (16k triangles), without convex parts",
+            title="YCB objects",
+            attribution=_CALLI,
             archive=True,
             max_bytes=200 * 10**6,
             max_unpacked_bytes=_GB,

@@ -22,6 +22,7 @@ from datagen.assets.unpack import Limits, unpack
 from datagen.schemas.errors import InputError
 from datagen.schemas.run_records import Digest, StoredRecord
 from datagen.schemas.safe_files import open_regular, read_regular, whole_file
+from datagen.workers.source_statement import STATEMENT
 
 LOCK_NAME = "assets.lock.json"
 _MAX_LOCK_BYTES = 2**20
@@ -102,6 +103,7 @@ def fetch(
         )
     size = kept.stat().st_size
     files = _install(asset, kept, folder)
+    _state(asset, folder / PurePosixPath(asset.holds or asset.into))
     entry = LockedDownload(
         name=asset.name,
         url=asset.url,
@@ -135,6 +137,14 @@ def _install(asset: CatalogueEntry, kept: Path, folder: Path) -> int:
     with kept.open("rb") as source, whole_file(home / asset.file, alone=True) as file:
         shutil.copyfileobj(source, file)
     return 1
+
+
+def _state(asset: CatalogueEntry, home: Path) -> None:
+    """Write the folder's statement, which runs copy, unless it has one."""
+    if asset.title and home.is_dir() and not (home / STATEMENT).exists():
+        stated = {"title": asset.title, "licence": asset.licence, "attribution": asset.attribution}
+        with whole_file(home / STATEMENT, alone=True) as file:
+            file.write(json.dumps(stated, indent=1).encode() + b"\n")
 
 
 def _sha256_of(path: Path) -> str:

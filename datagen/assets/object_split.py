@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular, whole_file
+from datagen.workers.source_statement import STATEMENT
 
 Part = Literal["train", "test"]
 EVERY = 5
@@ -80,5 +81,7 @@ def _write(source: Path, folder: Path, chosen: list[dict[str, Any]]) -> None:
         for path in entry["files"].values():
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source / path, folder / path)
+    if (source / STATEMENT).is_file():
+        shutil.copyfile(source / STATEMENT, folder / STATEMENT)
     with whole_file(index, alone=True) as file:
         file.write(text.encode())

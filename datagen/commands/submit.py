@@ -43,7 +43,7 @@ from datagen.workers.houses import open_houses
 from datagen.workers.labels import load_label_source
 from datagen.workers.objects import open_objects
 from datagen.workers.scenes.generate import generate_scene
-from datagen.workers.survey import Survey, counts_of, survey_sources
+from datagen.workers.survey import Survey, stored_notes, survey_sources
 from datagen.workers.world import World, assemble_world, open_world
 
 # Options that --scenes-from decides.
@@ -206,7 +206,7 @@ def _specified(options: SubmitOptions, shown: Progress) -> tuple[Run | None, Man
             _refuse_no_scene(world, houses)
         surveys = survey_sources(house_source, object_source, shown.counter("houses examined"))
         layout = layout_of(spec, options.n)
-        stored_in = counts_of(world.house_ids, world.object_names, surveys)
+        stored_in = stored_notes(world, surveys)
     else:
         given = given_options(options)
         stored = open_stored_scenes(

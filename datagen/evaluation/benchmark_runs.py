@@ -18,7 +18,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Manifest
 from datagen.schemas.storage import open_storage
-from datagen.workers.survey import counts_of, survey_sources
+from datagen.workers.survey import stored_notes, survey_sources
 from datagen.workers.world import open_world
 
 
@@ -58,7 +58,7 @@ def make_runs(
             refuse_other_engines(f"benchmark run {name}", wanted.spec)
             world = open_world(wanted.spec, houses, objects[wanted.objects])
             surveys = survey_sources(world.houses, world.objects, shown.counter("houses examined"))
-            counts = counts_of(world.house_ids, world.object_names, surveys)
+            counts = stored_notes(world, surveys)
             sources = {"houses": houses, "objects": objects[wanted.objects], **counts}
             manifests[name] = manifest_of(wanted.spec, layout_of(wanted.spec, wanted.n), sources)
     for name, wanted in runs.items():

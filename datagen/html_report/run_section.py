@@ -114,7 +114,7 @@ def _scenes(run: Run, columns: RunColumns) -> Iterator[str]:
 
 def _provenance(run: Run) -> Iterator[str]:
     manifest, spec = run.manifest, run.manifest.spec
-    about = described([spec])
+    about = described([spec], [manifest.sources])
     pairs = (manifest.sources, spec.engines, manifest.libraries)
     sources, engines, libraries = (", ".join(f"{k} {v}" for k, v in sorted(d.items())) for d in pairs)
     facts = [

@@ -254,28 +254,12 @@ class _Asset(NamedTuple):
     reference: str
 
 
+# Of what a folder holds only its own statement says the origin.
+_NOT_STATED = "not stated"
 _OURS = "datagen, which comes with it"
-_HOUSES = {
-    "builtin": _Asset("built-in houses", "Apache-2.0", _OURS),
-    "procthor": _Asset(
-        "ProcTHOR houses",
-        "Apache-2.0",
-        "Deitke et al., ProcTHOR: Large-Scale Embodied AI Using Procedural Generation, arXiv:2206.06994",
-    ),
-    "ai2thor": _Asset(
-        "AI2-THOR scenes",
-        "Apache-2.0",
-        "Kolve et al., AI2-THOR: An Interactive 3D Environment for Visual AI, 2017, arXiv:1712.05474",
-    ),
-}
-_OBJECTS = {
-    "builtin": _Asset("built-in objects", "Apache-2.0", _OURS),
-    "ycb": _Asset(
-        "YCB objects",
-        "CC-BY-4.0",
-        "Calli et al., Benchmarking in Manipulation Research: Using the Yale-CMU-Berkeley Object and Model "
-        "Set, 2015, doi:10.1109/MRA.2015.2448951",
-    ),
+_BUILTIN = {
+    "houses": _Asset("built-in houses", "Apache-2.0", _OURS),
+    "objects": _Asset("built-in objects", "Apache-2.0", _OURS),
 }
 # As the package states for its assets, which include the robots.
 _ROBOTS = _Asset(
@@ -291,11 +275,17 @@ _COMMENT = (
 )
 
 
-def described(specs: Sequence[Specification], samples: Sequence[int] = ()) -> dict[str, Any]:
-    """The global attributes of a store over runs of these specifications, with `samples` each."""
-    assets = list(dict.fromkeys(asset for spec in specs for asset in _assets(spec)))
+def described(
+    specs: Sequence[Specification], sources: Sequence[Mapping[str, str]], samples: Sequence[int] = ()
+) -> dict[str, Any]:
+    """The global attributes of a store over runs of these specifications, with `samples` each.
+
+    `sources` are those of the runs' manifests, which hold the statements of folders.
+    """
+    each = [_assets(spec, known) for spec, known in zip(specs, sources, strict=True)]
+    assets = list(dict.fromkeys(asset for found in each for asset in found))
     labels = _listed(spec.label_source for spec in specs)
-    houses, objects = (_listed(_assets(spec)[k].name for spec in specs) for k in (0, 1))
+    houses, objects = (_listed(found[k].name for found in each) for k in (0, 1))
     return {
         "Conventions": CONVENTIONS,
         "title": f"Robot base poses labelled by {labels}, in {houses} with {objects}",
@@ -307,7 +297,7 @@ def described(specs: Sequence[Specification], samples: Sequence[int] = ()) -> di
         "source": "; ".join(dict.fromkeys(map(_source, specs))),
         "license": "; ".join(f"{asset.name}: {asset.licence}" for asset in assets),
         "acknowledgement": "; ".join(f"{asset.name}: {asset.reference}" for asset in assets),
-        "references": "; ".join(dict.fromkeys(asset.reference for asset in assets)),
+        "references": "; ".join(dict.fromkeys(a.reference for a in assets if a.reference != _NOT_STATED)),
         "history": "\n".join(
             f"datagen submit {spec.label_source}{n}, seed {spec.seed}, split {spec.split}, "
             f"specification {spec.hash()}"
@@ -326,12 +316,13 @@ def cf_attributes(field: Field, table: Table) -> dict[str, Any]:
     return coordinates | ({"flag_values": list(range(len(field.codes)))} if field.codes else {})
 
 
-def _assets(spec: Specification) -> list[_Asset]:
+def _assets(spec: Specification, known: Mapping[str, str]) -> list[_Asset]:
     """Houses, objects and, for an arm, robots."""
     found: list[_Asset] = []
-    for known, source, what in ((_HOUSES, spec.houses, "houses"), (_OBJECTS, spec.objects, "objects")):
-        other = _Asset(f"{source.kind} {what}", "as their source states", f"source {source.kind}")
-        found.append(known.get(source.kind, other))
+    for what, source in (("houses", spec.houses), ("objects", spec.objects)):
+        title = known.get(f"{what}_title", f"{what} read as {source.kind}")
+        told = (known.get(f"{what}_{key}", _NOT_STATED) for key in ("licence", "attribution"))
+        found.append(_BUILTIN[what] if source.kind == "builtin" else _Asset(title, *told))
     return found if spec.arm is None else [*found, _ROBOTS]
 
 

@@ -62,7 +62,10 @@ def open_dataset(
     variables = {
         name: _variable([(shard, arrays[name]) for shard, arrays in shards], *shared[name]) for name in names
     }
-    attributes = described([spec for part in parts for spec in part.specs])
+    specs, sources = [s for part in parts for s in part.specs], [s for part in parts for s in part.sources]
+    attributes = described(specs, sources)
+    if len(parts) == 1:  # a sealed store states what its runs' manifests did
+        attributes |= {name: parts[0].attributes[name] for name in attributes if name in parts[0].attributes}
     coordinates = {name: variables.pop(name) for name in _COORDINATES} | _rows(parts)
     return xarray.Dataset(variables, coordinates, attributes)
 

@@ -26,7 +26,8 @@ _SEALED_FIX = "Seal the run again, and copy the whole data.zarr"
 class RunPart:
     """One run's shards and arrays, or those of a sealed store without its run.
 
-    A merged store has several `spec_hashes` and `specs`. `cost` is the sum over commits of wall and CPU
+    A merged store has several `spec_hashes`, `specs` and `sources`, which are those of the manifests. A sealed
+    store has empty `sources`, and its root's `attributes`. `cost` is the sum over commits of wall and CPU
     seconds, with those of the labels that a run was relabelled from; None for a sealed store. `merged` is
     the address of the merged runs that it is a part of: their parts have no scene in common.
     """
@@ -39,6 +40,8 @@ class RunPart:
     shards: Sequence[ShardPlace]
     arrays: Mapping[str, StoredArray]
     cost: Mapping[str, float] | None
+    sources: tuple[Mapping[str, str], ...]
+    attributes: Mapping[str, Any]
     merged: str = ""
 
 
@@ -113,8 +116,8 @@ def _open_run(run: Run, merged: str, names: Sequence[str], allow_incomplete: boo
     manifest = run.manifest
     version = manifest.schema_version
     specs, arrays = (manifest.spec,), {name: stored[name] for name in names}
-    spec_hashes, schema = (manifest.spec_hash,), manifest.schema_name
-    return RunPart(url, spec_hashes, specs, schema, version, shards, arrays, cost, merged)
+    hashes, schema, sources = (manifest.spec_hash,), manifest.schema_name, (manifest.sources,)
+    return RunPart(url, hashes, specs, schema, version, shards, arrays, cost, sources, {}, merged)
 
 
 def _refuse_unknown(url: str, names: Sequence[str], stored: Sequence[str]) -> None:
@@ -170,7 +173,8 @@ def open_sealed(path: Path | str, names: Sequence[str]) -> RunPart:
         ShardPlace(source, k, Rows(0, *layout.rows_wanted(k, n_samples)), per_shard, layout.samples_per_shard)
         for k in range(layout.shards_for(n_samples))
     ]
-    return RunPart(str(path), spec_hashes, specs, schema, version, slices, arrays, None)
+    sources = tuple({} for _ in specs)
+    return RunPart(str(path), spec_hashes, specs, schema, version, slices, arrays, None, sources, attributes)
 
 
 def refuse_mixed_labels(parts: Sequence[tuple[str, Specification]]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from datagen.schemas.errors import InputError
 from datagen.workers.content_cache import CacheFolder
 from datagen.workers.houses.house import HouseSource
 from datagen.workers.objects.model import ObjectSource
+from datagen.workers.world import World
 
 # Raise it when the same house may be judged differently.
 _VERSION = 1
@@ -50,15 +51,21 @@ def survey_sources(
     return {what: survey for what, survey in found.items() if survey is not None}
 
 
-def counts_of(
-    house_ids: Sequence[str], object_names: Sequence[str], surveys: Mapping[str, Survey]
-) -> dict[str, str]:
-    """Numbers of houses and objects for a manifest: "2 of 6" where four of six houses are unusable."""
+def stored_notes(world: World, surveys: Mapping[str, Survey]) -> dict[str, str]:
+    """Numbers of houses and objects, and what their folders state of themselves, for a manifest.
+
+    The number is "2 of 6" where four of six houses are unusable.
+    """
+    house_ids, object_names = world.house_ids, world.object_names
     bad = surveys["houses"].unusable if "houses" in surveys else {}
     usable = sum(house_id not in bad for house_id in house_ids)
     of = f" of {len(house_ids)}" if usable < len(house_ids) else ""
     counts = {"n_houses": f"{usable}{of}", "n_objects": str(len(object_names))}
-    return counts | {f"{what}_read": str(survey) for what, survey in surveys.items()}
+    counts |= {f"{what}_read": str(survey) for what, survey in surveys.items()}
+    for what, source in (("houses", world.houses), ("objects", world.objects)):
+        stated: Mapping[str, str] = getattr(source, "statement", {})
+        counts |= {f"{what}_{key}": text for key, text in stated.items()}
+    return counts
 
 
 def _of_houses(source: HouseSource, seen: Callable[[int, int], object]) -> Survey | None:

@@ -8,8 +8,10 @@ from typing import Any
 
 import pytest
 
+import datagen
 from datagen import cli
 from datagen.schemas.run import Run
+from tests.refusals import refused
 from tests.small_runs import PER_SCENE, submit_arguments
 from tests.workers.houses.house_files import thing, two_rooms, write_houses, xyz
 from tests.workers.objects.toy_set import write_bundle
@@ -87,3 +89,27 @@ def test_scenes_that_are_labelled_again_keep_the_counts(tmp_path: Path) -> None:
     assert cli.run(["submit", "heuristic", "--n", str(PER_SCENE), *again]) == 0
     known, kept = (dict(Run.open(tmp_path / name).manifest.sources) for name in ("run", "again"))
     assert kept.pop("scenes_from") and kept == known
+
+
+def test_licences_are_those_that_the_folders_state(tmp_path: Path) -> None:
+    arguments = submitted(tmp_path)
+    assert cli.run(arguments) == 0
+    assert datagen.open_dataset(tmp_path / "run").attrs["license"] == (
+        "houses read as procthor: not stated; objects read as ycb: not stated"
+    )
+    stated = {"title": "Toys", "licence": "CC0-1.0", "attribution": "A. Maker", "more": 1}
+    (tmp_path / "objects/source.json").write_text(json.dumps(stated))
+    arguments[arguments.index(str(tmp_path / "run"))] = str(tmp_path / "stated")
+    assert cli.run(arguments) == 0
+    for path in (tmp_path / "stated", tmp_path / "stated/data.zarr"):
+        told = datagen.open_dataset(path).attrs
+        assert told["license"] == "houses read as procthor: not stated; Toys: CC0-1.0"
+        assert told["title"].endswith("in houses read as procthor with Toys")
+        assert told["references"] == "A. Maker"
+
+
+@pytest.mark.parametrize("text", ['{"licence": 1}', "[]", "{", '{"title": "\\u0007"}'])
+def test_a_bad_statement_is_named(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = submitted(tmp_path)
+    (tmp_path / "houses/source.json").write_text(text)
+    refused(arguments, capsys, "houses/source.json")

@@ -285,12 +285,19 @@ def test_the_store_says_its_conventions_source_licences_and_coordinates(tmp_path
         }
     )
     run = make_run(tmp_path / "a", n=13, spec=spec)
+    told = xarray.open_zarr(seal(run.storage), chunks=None).attrs
+    assert told["title"].endswith("in houses read as procthor with objects read as ycb")
+    assert told["license"] == "houses read as procthor: not stated; objects read as ycb: not stated"
+    assert told["references"] == ""
+    stated = {"title": "My houses", "licence": "CC0-1.0", "attribution": "me"}
+    sources = {f"houses_{key}": text for key, text in stated.items()} | {"objects_licence": "MIT"}
+    run = make_run(tmp_path / "b", n=13, spec=spec, sources=sources)
     data = xarray.open_zarr(seal(run.storage), chunks=None)
     told = data.attrs
     assert told["Conventions"] == "CF-1.11, ACDD-1.3"
-    assert told["title"] == "Robot base poses labelled by heuristic, in ProcTHOR houses with YCB objects"
-    assert told["license"] == "ProcTHOR houses: Apache-2.0; YCB objects: CC-BY-4.0"
-    assert "arXiv:2206.06994" in told["references"] and "Calli" in told["acknowledgement"]
+    assert told["title"] == "Robot base poses labelled by heuristic, in My houses with objects read as ycb"
+    assert told["license"] == "My houses: CC0-1.0; objects read as ycb: MIT"
+    assert told["references"] == "me" and told["acknowledgement"].startswith("My houses: me; ")
     assert f"objects ycb sha256 {'2' * 64}" in told["source"]
     assert (
         told["history"].startswith("datagen submit heuristic --n 13, seed 0")

@@ -146,8 +146,9 @@ def sealed_metadata(contents: Contents) -> dict[str, bytes]:
     if len(parts) > 1:
         del attributes["spec_hash"]
     attributes |= {"parts": parts, "rows_sha256": contents.digest()}
-    specs = [sealed.run.manifest.spec for sealed in contents.runs]
-    attributes = described(specs, [sealed.n for sealed in contents.runs]) | attributes
+    manifests = [sealed.run.manifest for sealed in contents.runs]
+    specs, sources = [m.spec for m in manifests], [m.sources for m in manifests]
+    attributes = described(specs, sources, [sealed.n for sealed in contents.runs]) | attributes
     rows = {table: contents.rows(table) for table in TABLES}
     of_arrays = {f.name: cf_attributes(f, table) for table, f in contents.schema.fields}
     files = zarr_metadata(contents.schema, contents.layout, rows, attributes, of_arrays, is_sharded=True)

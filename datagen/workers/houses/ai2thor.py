@@ -46,6 +46,7 @@ from datagen.workers.houses.mesh_geometry import (
 )
 from datagen.workers.houses.walls_and_floors import MAX_CORNERS, clean_polygon
 from datagen.workers.json_document import EXTENT_M, JsonNode, parse_json
+from datagen.workers.source_statement import read_statement
 
 _SUFFIX = ".scene_instance.json"
 _SCENES = Path("ai2thor-hab/configs/scenes")
@@ -89,6 +90,7 @@ class Ai2thorHouses:
     digest: str
     scenes: dict[str, Path]
     types: dict[int, str]
+    statement: Mapping[str, str] = field(default_factory=dict)
     kind: str = "ai2thor"
     _templates: OrderedDict[Path, _Template] = field(default_factory=OrderedDict)
 
@@ -127,7 +129,7 @@ class Ai2thorHouses:
         return House(house_id, digest.hexdigest(), tuple(rooms), tuple(bodies), tuple(surfaces), findings)
 
     def examine(self, house_id: str) -> Mapping[str, int]:
-        """The findings of the house. Raises InputError as `load` does, but for meshes, which it does not read."""
+        """The findings of the house; its meshes are not read. Raises InputError as `load` does for others."""
         return self._instances(self._scene(house_id)[0])[1]
 
     def _scene(self, house_id: str) -> tuple[JsonNode, bytes]:
@@ -227,7 +229,8 @@ def open_ai2thor(folder: str) -> Ai2thorHouses:
     listing += [[p.relative_to(root).as_posix(), n] for p, n in files]
     types = _types(root)
     scenes = {i: top / f"{i}{_SUFFIX}" for i in sorted(sizes)}
-    return Ai2thorHouses(root, digest_of([listing, sorted(types.items())]), scenes, types)
+    digest = digest_of([listing, sorted(types.items())])
+    return Ai2thorHouses(root, digest, scenes, types, read_statement(root))
 
 
 def _sizes(folder: Path, pattern: str) -> list[tuple[Path, int]]:

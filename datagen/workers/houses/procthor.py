@@ -17,6 +17,7 @@ from datagen.workers.houses.house import House
 from datagen.workers.houses.line_index import MAX_LINES, Line, LineIndex, open_lines
 from datagen.workers.houses.loader import build_house, read_house
 from datagen.workers.json_document import JsonNode, parse_json
+from datagen.workers.source_statement import read_statement
 
 _MAX_FILES = 100_000
 _Place = tuple[LineIndex, Line]
@@ -31,6 +32,7 @@ class ProcthorHouses:
     assets: dict[str, Asset]
     places: dict[str, _Place]  # by id
     clashes: dict[str, str] = field(default_factory=dict)  # id -> the lines that share it
+    statement: Mapping[str, str] = field(default_factory=dict)
     kind: str = "procthor"
 
     def house_ids(self) -> list[str]:
@@ -88,7 +90,7 @@ def open_procthor(folder: str) -> ProcthorHouses:
         raise InputError(path, "", "has files without houses", fix)
     digests = [[house_id, line.sha256] for house_id, (_, line) in places.items()]
     digest = digest_of([digests, hash_bytes(table.decode("utf-8", "replace")).hex()])
-    return ProcthorHouses(digest, path, assets, places, clashes)
+    return ProcthorHouses(digest, path, assets, places, clashes, read_statement(path))
 
 
 def _by_id(files: list[LineIndex]) -> tuple[dict[str, _Place], dict[str, str]]:

@@ -14,6 +14,7 @@ from datagen.workers.objects.exclusions import reason_to_exclude
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.objects.scan import READER_VERSION, Scan, load_scan, volumes_m3
 from datagen.workers.objects.ycb_layouts import Entry, read_layout
+from datagen.workers.source_statement import read_statement
 
 
 class YcbObjects:
@@ -29,6 +30,7 @@ class YcbObjects:
     def __init__(self, folder: Path) -> None:
         """Raises InputError that names the file, the object and the field."""
         index, entries = read_layout(folder)
+        self.statement = read_statement(folder)
         excluded: dict[str, str] = {}
         self._entries: dict[str, tuple[Entry, float]] = {}
         self._models: dict[str, ObjectModel] = {}

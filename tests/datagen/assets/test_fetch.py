@@ -20,6 +20,7 @@ from datagen.assets.catalogue import CATALOGUE, CatalogueEntry, select
 from datagen.assets.download import DownloadPolicy, download
 from datagen.assets.fetch import LOCK_NAME, fetch, read_lock
 from datagen.schemas.errors import InputError
+from datagen.workers.source_statement import read_statement
 from tests.datagen.assets.flaky_server import Site, serve
 
 BODY = np.random.default_rng(0).bytes(700_000)
@@ -166,6 +167,19 @@ def test_first_use_is_recorded_and_then_held_to(site: Site, tmp_path: Path) -> N
     with pytest.raises(InputError, match="not the expected file"):
         fetch(_asset(), tmp_path / "out", cache=tmp_path / "c2", mirror=site.url, policy=quick)
     assert (tmp_path / "out/toy/a/b.txt").read_bytes() == b"hello"
+
+
+def test_the_folder_states_its_licence_and_keeps_a_statement_of_its_own(site: Site, tmp_path: Path) -> None:
+    site.files["/toy.zip"] = _zip({"set/a.txt": b"hello"})
+    asset = _asset(title="Toys", attribution="A. Maker", holds="toy/set")
+    fetch(asset, tmp_path / "out", cache=tmp_path / "c", mirror=site.url)
+    stated = {"title": "Toys", "licence": "CC0-1.0", "attribution": "A. Maker"}
+    assert read_statement(tmp_path / "out/toy/set") == stated
+    (tmp_path / "out/toy/set/source.json").write_text('{"title": "Mine"}')
+    fetch(asset, tmp_path / "out", cache=tmp_path / "c", mirror=site.url)
+    assert read_statement(tmp_path / "out/toy/set") == {"title": "Mine"}
+    fetch(_asset(), tmp_path / "plain", cache=tmp_path / "c", mirror=site.url)
+    assert read_statement(tmp_path / "plain/toy/set") == {}
 
 
 def test_a_spoilt_cache_is_fetched_again_and_a_kept_download_used_again(site: Site, tmp_path: Path) -> None:

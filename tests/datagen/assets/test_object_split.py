@@ -28,6 +28,7 @@ def ycb_folder(folder: Path, *, path: str = "{key}/a.obj", n: int = 10, **more: 
 
 def test_objects_are_split_by_their_names(tmp_path: Path) -> None:
     source, out = ycb_folder(tmp_path / "ycb"), tmp_path / "out"
+    (source / "source.json").write_text('{"licence": "CC0-1.0"}')
     assert cli.run(["assets", "split", str(source), str(out)]) == 0
     keys = {
         n: [e["key"] for e in json.loads((out / n / "objects.json").read_text())] for n in ("train", "test")
@@ -35,7 +36,8 @@ def test_objects_are_split_by_their_names(tmp_path: Path) -> None:
     assert keys["test"] == ["004_thing", "009_thing"]
     assert sorted(keys["train"] + keys["test"]) == [f"{i:03}_thing" for i in range(10)]
     before = files_of(out)
-    assert before["test/009_thing/a.obj"] == b"009_thing" and len(before) == 12
+    assert before["test/009_thing/a.obj"] == b"009_thing" and len(before) == 14
+    assert before["train/source.json"] == before["test/source.json"] == b'{"licence": "CC0-1.0"}'
     assert cli.run(["assets", "split", str(source), str(out)]) == 0
     assert files_of(out) == before
     # One of its own results, split again into the place where it lies.
