@@ -26,10 +26,10 @@ _SEALED_FIX = "Seal the run again, and copy the whole data.zarr"
 class RunPart:
     """One run's shards and arrays, or those of a sealed store without its run.
 
-    A merged store has several `spec_hashes`, `specs` and `sources`, which are those of the manifests. A sealed
-    store has empty `sources`, and its root's `attributes`. `cost` is the sum over commits of wall and CPU
-    seconds, with those of the labels that a run was relabelled from; None for a sealed store. `merged` is
-    the address of the merged runs that it is a part of: their parts have no scene in common.
+    A merged store has several `spec_hashes`, `specs` and `sources`, those of their manifests. A sealed store
+    has empty `sources`, and its root's `attributes`. `cost` is the sum over commits of wall and CPU seconds,
+    with those of the labels that a run was relabelled from; None for a sealed store. `merged` is the address
+    of the merged runs that it is a part of: their parts have no scene in common.
     """
 
     place: str

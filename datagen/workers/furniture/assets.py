@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from datagen.schemas.errors import InputError
@@ -11,6 +12,7 @@ from datagen.schemas.safe_files import read_regular
 from datagen.workers.json_document import JsonNode, parse_json
 
 TABLE_NAMES = ("asset_sizes.json", "asset-database.json")
+_SUPPORT_HEIGHTS = Path(__file__).with_name("support_heights.json")
 _LARGEST_TABLE_BYTES = 64 << 20
 _MAX_ASSETS = 200_000
 _MAX_SIZE_M = 20.0
@@ -38,10 +40,11 @@ class Asset:
 
 
 def read_asset_table(folder: Path) -> tuple[dict[str, Asset], bytes]:
-    """The folder's size table by asset id, and its bytes (for the digest).
+    """The folder's size table by asset id, and the bytes that decide on it (for the digest).
 
     Reads `asset_sizes.json` ({assetId: {objectType, size}}), or else AI2-THOR's own
-    `asset-database.json` ({objectType: [{assetId, boundingBox}]} or one flat list).
+    `asset-database.json` ({objectType: [{assetId, boundingBox}]} or one flat list), which has no
+    heights at which things rest: `support_heights.json` of this package has them.
     """
     path = next((folder / name for name in TABLE_NAMES if (folder / name).exists()), None)
     fix = "Put asset_sizes.json into the folder; `datagen assets fetch procthor-10k` gets both."
@@ -52,7 +55,18 @@ def read_asset_table(folder: Path) -> tuple[dict[str, Asset], bytes]:
     assets = {asset.asset_id: asset for asset in _assets(root)}
     if not assets:
         raise InputError(path, "", "is an empty size table", fix)
-    return assets, text
+    if path.name == TABLE_NAMES[0]:
+        return assets, text
+    heights = _SUPPORT_HEIGHTS.read_bytes()
+    known = json.loads(heights)["assets"]
+    return {i: _with_heights(asset, known.get(i)) for i, asset in assets.items()}, text + heights
+
+
+def _with_heights(asset: Asset, known: tuple[float, float | None, list[float]] | None) -> Asset:
+    """The asset with the heights at which things were seen to rest on an asset of its id and height."""
+    if known is None or abs(known[0] - asset.size_m[2]) > 1e-3:
+        return asset
+    return replace(asset, rest_height_m=known[1], levels_m=tuple(known[2]))
 
 
 def _assets(root: JsonNode) -> Iterator[Asset]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,29 @@ def test_small_things_on_tops_neither_float_nor_sink(houses: list[House]):
                     gaps.append(low)
     assert len(gaps) > 200
     assert np.mean(np.abs(gaps) < 1e-3) > 0.97
+
+
+def test_the_asset_database_that_is_fetched_gives_the_same_houses(
+    source: HouseSource, houses: list[House], assets: Path, tmp_path: Path
+):
+    """ProcTHOR's own table has sizes alone, where that of the real set has heights at which things rest."""
+    table = json.loads((assets / "procthor/asset_sizes.json").read_text())
+    entries = [
+        {"assetId": i, "objectType": v["objectType"], "boundingBox": dict(zip("xyz", v["size"], strict=True))}
+        for i, v in table.items()
+    ]
+    (tmp_path / "asset-database.json").write_text(json.dumps(entries))
+    for file in (assets / "procthor").glob("*.jsonl.gz"):
+        (tmp_path / file.name).symlink_to(file)
+    fetched = open_houses(f"procthor:{tmp_path}")
+    assert fetched.digest != source.digest
+    for ours in houses[::2]:
+        theirs = fetched.load(ours.house_id)
+        assert [s.surface_id for s in theirs.surfaces] == [s.surface_id for s in ours.surfaces]
+        for a, b in zip(theirs.bodies, ours.bodies, strict=True):
+            np.testing.assert_array_equal(a.visual.vertices_m, b.visual.vertices_m)
+        for a, b in zip(theirs.surfaces, ours.surfaces, strict=True):
+            np.testing.assert_array_equal(a.T_world_surface, b.T_world_surface)
 
 
 def test_furniture_stands_on_the_floor_inside_its_room(houses: list[House]):

@@ -14,7 +14,9 @@ import pytest
 
 from datagen.schemas.errors import InputError
 from datagen.workers.houses import HOUSE_SOURCES, ids_of_split, open_houses, split_of
-from tests.workers.houses.house_files import SIZES, two_rooms, write_houses
+from tests.workers.houses.house_files import SIZES, thing, two_rooms, write_houses, xyz
+
+DESK_M, DESK_TOP_M = 1.21037, 0.734
 
 
 def named(name: str, **more: object) -> dict:
@@ -64,6 +66,28 @@ def test_the_original_asset_database_serves_as_well(tmp_path: Path):
         (tmp_path / "asset-database.json").write_text(json.dumps(table))
         house = open_houses(f"procthor:{tmp_path}").load("two-rooms")
         assert [s.height_m for s in house.surfaces] == [pytest.approx(0.75)]
+
+
+def test_things_rest_on_a_desk_of_the_original_database_as_they_were_observed(tmp_path: Path):
+    """The hutch of the desk reaches 1.21 m; things stand on its top."""
+    house = two_rooms()
+    mug = thing("m", "Mug_1", xyz(1.5, 0.9, 1.6))
+    house["objects"] = [thing("d", "Desk_305_1", xyz(1.5, DESK_M / 2, 1.5), children=[mug])]
+    write_houses(tmp_path, [house], sizes=None)
+    sizes = {"Desk_305_1": ("Desk", 1.4, DESK_M, 0.6), "Mug_1": ("Mug", 0.1, 0.1, 0.1)}
+    entries = [
+        {"assetId": i, "objectType": kind, "boundingBox": dict(zip("xyz", size, strict=True))}
+        for i, (kind, *size) in sizes.items()
+    ]
+    (tmp_path / "asset-database.json").write_text(json.dumps(entries))
+    (surface, *_) = open_houses(f"procthor:{tmp_path}").load("two-rooms").surfaces
+    assert surface.height_m == pytest.approx(DESK_TOP_M)
+    entries[0]["boundingBox"]["y"] = 1.5  # another desk under the same name: nothing is known of it
+    house["objects"][0]["position"]["y"] = 0.75
+    write_houses(tmp_path, [house], sizes=None)
+    (tmp_path / "asset-database.json").write_text(json.dumps(entries))
+    (surface, *_) = open_houses(f"procthor:{tmp_path}").load("two-rooms").surfaces
+    assert surface.height_m == pytest.approx(1.5)
 
 
 def test_damaged_packed_houses_are_read_from_the_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
