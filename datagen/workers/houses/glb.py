@@ -14,6 +14,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.geometry.mesh import F64, U8, Mesh
 from datagen.workers.json_document import parse_json
+from datagen.workers.objects.texture import rgb_of
 
 MAX_FILE_BYTES = 256 << 20
 MAX_FACES = 500_000
@@ -121,7 +122,7 @@ def _face_rgb(piece: Any) -> U8:
         return np.tile(np.clip(rgb, 0, 255).astype(np.uint8), (count, 1))
     if image.width * image.height > _MAX_TEXTURE_PX:
         raise ValueError("a texture of more than 64 million pixels")
-    pixels = np.asarray(image.convert("RGB"))
+    pixels = np.asarray(rgb_of(image))
     middle = np.asarray(uv, np.float64)[piece.faces].mean(1) % 1.0
     rows = np.clip(((1.0 - middle[:, 1]) * image.height).astype(int), 0, image.height - 1)
     columns = np.clip((middle[:, 0] * image.width).astype(int), 0, image.width - 1)

@@ -19,6 +19,9 @@ from datagen.workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
 # A part thinner than this counts as a sheet: physics engines reject it or become unstable.
 MIN_THICKNESS_M = 1e-4
 MAX_PARTS = 1024
+# A vertex of a part lies at most so far within the part's hull, plus a share of its size.
+_MAX_DEPTH_M, _MAX_DEPTH_SHARE = 0.002, 0.02
+_MAX_ENCLOSED = 1.2
 
 # Part of a cache key: raise it when `fits_gripper` changes its results.
 GRIPPER_VERSION = 1
@@ -44,8 +47,8 @@ def read_convex_parts(path: Path) -> ConvexParts:
     """Reads a convex decomposition: OBJ with one `o` group per part, or PLY.
 
     Without groups (PLY, plain OBJ) each connected component is a part, which is how SAPIEN splits
-    such files too. Raises InputError naming the file: unreadable, no faces, only flat parts, more
-    than `MAX_PARTS` parts.
+    such files too. Raises InputError naming the file: unreadable, no faces, only flat parts, parts that
+    are not convex, more than `MAX_PARTS` parts.
     """
     if path.suffix.lower() == ".ply":
         vertices, groups = _read_ply(path)
@@ -61,6 +64,10 @@ def read_convex_parts(path: Path) -> ConvexParts:
             f"{len(groups)} convex parts, more than the {MAX_PARTS} allowed",
             "Merge them to a coarser decomposition",
         )
+    for number, faces in enumerate(groups, 1):
+        if problem := _not_convex(vertices, faces):
+            fix = "Give a convex decomposition, one `o` group for each part, not the visual mesh"
+            raise InputError(path, f"part {number}", f"not convex: {problem}", fix)
     parts = convex_parts(vertices[np.unique(faces)] for faces in groups)
     if not parts.vertices_m:
         raise InputError(path, "", "every collision part is flat", "Give convex parts with volume")
@@ -80,6 +87,25 @@ def convex_parts(points_m: Iterable[npt.NDArray[np.floating]]) -> ConvexParts:
             volume += float(hull.volume)
             kept.append(np.asarray(points, np.float32)[np.sort(hull.vertices)])
     return ConvexParts(tuple(kept), volume)
+
+
+def _not_convex(vertices: F64, faces: npt.NDArray[np.int64]) -> str:
+    """The problem of a part that its hull does not stand for; "" if the hull does, or the part is flat."""
+    points_m = vertices[np.unique(faces)]
+    try:
+        hull = ConvexHull(points_m)
+    except (QhullError, ValueError):
+        return ""
+    depth_m = 0.0
+    for start in range(0, len(points_m), 4096):
+        heights = points_m[start : start + 4096] @ hull.equations[:, :3].T + hull.equations[:, 3]
+        depth_m = max(depth_m, float(-heights.max(axis=1).min()))
+    if depth_m > _MAX_DEPTH_M + _MAX_DEPTH_SHARE * np.ptp(points_m, axis=0).max():
+        return f"a vertex lies {1000 * depth_m:.0f} mm within its hull"
+    # Cones from a point within to the faces fill a convex body once, whatever the order of corners.
+    corners = vertices[np.unique(np.sort(faces, axis=1), axis=0)] - points_m[hull.vertices].mean(axis=0)
+    share = float(np.abs(np.linalg.det(corners)).sum()) / 6 / hull.volume
+    return f"its surface encloses its hull {share:.1f} times" if share > _MAX_ENCLOSED else ""
 
 
 def _read_ply(path: Path) -> tuple[F64, list[npt.NDArray[np.int64]]]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from datagen.schemas.errors import InputError
+from datagen.schemas.errors import InputError, printable
 from datagen.schemas.safe_files import open_regular
 from datagen.workers.geometry.mesh import F64
 
@@ -40,6 +40,8 @@ class ObjMesh:
     faces: I64  # (F, 3) into vertices
     uv_faces: I64  # (F, 3) into uv, -1 where a corner has none
     group_starts: I64  # (G,) index of the first face of each `o` (or else `g`) group
+    material_library: str = ""
+    materials: tuple[str, ...] = ()  # those of its faces, by first use
 
     def group_faces(self) -> list[I64]:
         """The faces of each named group that has any; all faces as one group where none is named."""
@@ -56,8 +58,9 @@ def read_obj(path: Path) -> ObjMesh:
     """
     vertices, uv, faces, uv_faces = array("d"), array("d"), array("q"), array("q")
     starts: dict[bytes, list[int]] = {b"o": [], b"g": []}
+    library, materials = "", list[tuple[int, str]]()
     for number, kind, line in _pieces(path):
-        keyword, _, rest = line.lstrip().partition(b" ")
+        keyword, rest = _split(line)
         try:
             if kind == "v":
                 vertices.frombytes(numbers_of(line, kind).tobytes())
@@ -84,10 +87,14 @@ def read_obj(path: Path) -> ObjMesh:
                 starts[keyword].append(len(faces) // 3)
                 if len(starts[keyword]) > MAX_NAMES:
                     raise ValueError(f"more than {MAX_NAMES:,} groups")
-            elif b"\t" in keyword:
-                raise ValueError("a tab follows the keyword")
+            elif keyword == b"mtllib":
+                library = library or _name(rest)
+            elif keyword == b"usemtl":
+                materials.append((len(faces) // 3, _name(rest)))
+                if len(materials) > MAX_NAMES:
+                    raise ValueError(f"more than {MAX_NAMES:,} materials")
         except ValueError as error:
-            shown = line[:60].decode("utf-8", "replace").strip()
+            shown = printable(line[:60].decode("utf-8", "replace").strip())
             fix = "Export the mesh again as text OBJ"
             raise InputError(path, f"line {number}", f"{error}: {shown!r}", fix) from None
         if len(faces) > 3 * MAX_FACES or len(vertices) > 3 * MAX_VERTICES or len(uv) > 2 * MAX_VERTICES:
@@ -101,6 +108,8 @@ def read_obj(path: Path) -> ObjMesh:
         np.array(faces).reshape(-1, 3) - 1,
         np.array(uv_faces).reshape(-1, 3) - 1,
         np.array(starts[b"o"] or starts[b"g"], np.int64),
+        library,
+        _of_faces(materials, len(faces) // 3),
     )
     _check_indices(path, mesh)
     return mesh
@@ -118,32 +127,72 @@ def read_obj_header(path: Path) -> ObjHeader:
     """The mtllib and usemtl names of a file, without parsing its numbers. Raises InputError."""
     names: dict[bytes, dict[str, None]] = {b"mtllib": {}, b"usemtl": {}}
     for _, _, line in _pieces(path):
-        keyword, _, name = line.partition(b" ")
+        keyword, name = _split(line)
         if keyword in names:
-            names[keyword][name.strip().decode("utf-8", "replace")] = None
+            names[keyword][_name(name)] = None
             if len(names[keyword]) > MAX_NAMES:
                 raise InputError(path, "", f"the mesh has more than {MAX_NAMES:,} materials", "Join them")
     return ObjHeader(next(iter(names[b"mtllib"]), ""), tuple(names[b"usemtl"]))
 
 
 def _pieces(path: Path) -> Iterator[tuple[int, str, bytes]]:
-    """Yields (first line number from 1, kind, text) of each run of plain lines, or of one line of kind ""."""
+    """Yields (first line number from 1, kind, text) of each run of plain lines, or of one line of kind "".
+
+    Lines may end with \\n, \\r\\n or \\r; one that ends with a backslash continues on the next.
+    """
     number = 1
+    for block in _blocks(path):
+        start = 0
+        while start < len(block):
+            kind, end = plain_run(block, start)
+            while not kind and block[start:end].endswith(b"\\\n") and end < len(block):
+                if block[start:end].lstrip().startswith(b"#"):
+                    break
+                end = block.find(b"\n", end) + 1 or len(block)
+            piece = block[start:end]
+            lines = piece.count(b"\n") or 1
+            if not kind and len(piece.rstrip(b"\n")) >= MAX_LINE_BYTES:
+                raise InputError(path, f"line {number}", "the line is too long", "Give a text OBJ file")
+            if number + lines - 1 > MAX_LINES:
+                raise InputError(path, "", f"more than {MAX_LINES:,} lines", "Simplify the mesh")
+            yield number, kind, piece if kind else piece.replace(b"\\\n", b" ")
+            number, start = number + lines, end
+
+
+def _blocks(path: Path) -> Iterator[bytes]:
+    """The file in blocks of whole lines, each with \\n at its end, continued lines in one block."""
     with open_regular(path, MAX_FILE_BYTES, "Give a text OBJ file of a simplified mesh") as file:
+        rest = b""
         while block := file.read(_BLOCK_BYTES):
-            if not block.endswith(b"\n"):
-                block += file.readline(MAX_LINE_BYTES)
-            start = 0
-            while start < len(block):
-                kind, end = plain_run(block, start)
-                piece = block[start:end]
-                lines = piece.count(b"\n") if kind else 1
-                if not kind and len(piece.rstrip(b"\n")) >= MAX_LINE_BYTES:
-                    raise InputError(path, f"line {number}", "the line is too long", "Give a text OBJ file")
-                if number + lines - 1 > MAX_LINES:
-                    raise InputError(path, "", f"more than {MAX_LINES:,} lines", "Simplify the mesh")
-                yield number, kind, piece
-                number, start = number + lines, end
+            block = rest + block
+            held = b"\r" if block.endswith(b"\r") else b""  # perhaps the first half of \r\n
+            if b"\r" in block:
+                block = block[: len(block) - len(held)].replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+            end = block.rfind(b"\n") + 1
+            while block[:end].endswith(b"\\\n"):
+                end = block.rfind(b"\n", 0, end - 1) + 1
+            if end:
+                yield block[:end]
+            rest = block[end:] + held
+            if len(rest) > MAX_LINE_BYTES:  # `_pieces` names its line
+                break
+        yield rest.replace(b"\r", b"\n")
+
+
+def _split(line: bytes) -> tuple[bytes, bytes]:
+    """The keyword of a line and what follows it."""
+    words = line.split(None, 1)
+    return (words[0] if words else b""), (words[1] if len(words) > 1 else b"")
+
+
+def _name(text: bytes) -> str:
+    return text.strip().decode("utf-8", "replace")
+
+
+def _of_faces(materials: list[tuple[int, str]], n_faces: int) -> tuple[str, ...]:
+    """The distinct materials, each given with the index of its first face, that any face has."""
+    ends = [start for start, _ in materials[1:]] + [n_faces]
+    return tuple(dict.fromkeys(name for (a, name), b in zip(materials, ends, strict=False) if b > a))
 
 
 def _numbers(text: bytes, width: int) -> list[float]:

@@ -15,11 +15,16 @@ from datagen.schemas.safe_files import open_regular
 from datagen.workers.content_cache import Arrays, CacheFolder
 from datagen.workers.geometry.mesh import F32, Mesh, Texture
 from datagen.workers.objects.convex import ConvexParts, read_convex_parts
+from datagen.workers.objects.materials import texture_of_materials
 from datagen.workers.objects.obj_file import MAX_FILE_BYTES, ObjMesh, read_obj
 from datagen.workers.objects.texture import face_colours, read_texture
 
-# Part of every cache key: raise it when the same files are read differently.
+# Part of every digest: raise it when the same files, if they were read before, are read differently.
 READER_VERSION = 1
+# Part of every cache key: raise it also when files are refused that were read before.
+_CACHE_VERSION = 2
+# A mesh stands where its lowest point is within the first of 0, and does not beyond the second.
+_STANDS_M = (0.01, 0.015)
 MIN_SIZE_M = 0.002
 MAX_SIZE_M = 2.0
 _CACHE = CacheFolder("objects", most_files=1024)
@@ -59,7 +64,7 @@ def load_scan(files: ScanFiles) -> Scan:
 
     Raises InputError as `read_scan` does; an unusable cache costs only time.
     """
-    key = f"{files.digest}-{READER_VERSION}"
+    key = f"{files.digest}-{_CACHE_VERSION}"
     stored = _CACHE.load(key)
     if stored is not None:
         return _restored(stored)
@@ -73,7 +78,7 @@ def volumes_m3(files: Sequence[ScanFiles]) -> list[float]:
 
     Raises InputError as `read_scan` does.
     """
-    key = f"{digest_of([scan.digest for scan in files])}-{READER_VERSION}"
+    key = f"{digest_of([scan.digest for scan in files])}-{_CACHE_VERSION}"
     stored = _VOLUMES.load(key)
     if stored is None:
         stored = {"volumes_m3": np.array([load_scan(scan).parts.volume_m3 for scan in files], np.float64)}
@@ -86,11 +91,14 @@ def read_scan(visual: Path, texture: Path, collision: Path) -> Scan:
 
     Vertices that carry several texture coordinates are split, so that `uv` has one per vertex.
     Raises InputError naming the file: see `read_obj`, `read_texture` and `read_convex_parts`, and
-    a mesh without texture coordinates, of absurd size, or away from its collision parts.
+    a mesh without texture coordinates, of several textures, of absurd size, that lies on its side, or away
+    from its collision parts.
     """
     mesh = read_obj(visual)
     if (mesh.uv_faces < 0).any():
         raise InputError(visual, "f", "a face has no texture coordinates", "Export the mesh with UVs")
+    if len(mesh.materials) > 1:
+        _refuse_other_textures(visual, mesh)
     used = mesh.vertices[np.unique(mesh.faces)]
     low, high = used.min(axis=0), used.max(axis=0)
     size = high - low
@@ -101,6 +109,9 @@ def read_scan(visual: Path, texture: Path, collision: Path) -> Scan:
             f"the mesh spans {size.max():.4g} m, where {MIN_SIZE_M} to {MAX_SIZE_M} m are expected",
             "Scale the mesh to metres",
         )
+    if size[1] > _STANDS_M[1] and abs(low[1]) < _STANDS_M[0] and low[2] < -_STANDS_M[1]:
+        problem = f"y is up: the mesh stands on y = {low[1]:.3f} and reaches down to z = {low[2]:.3f} m"
+        raise InputError(visual, "v", problem, "Export both meshes with z up")
     centre = (low + high) / 2
     vertices, uv, faces = _split_seams(mesh)
     image = read_texture(texture)
@@ -124,6 +135,15 @@ def read_scan(visual: Path, texture: Path, collision: Path) -> Scan:
         ConvexParts(centred, parts.volume_m3),
         (float(size[0]), float(size[1]), float(size[2])),
     )
+
+
+def _refuse_other_textures(visual: Path, mesh: ObjMesh) -> None:
+    """Raise InputError unless the library gives all materials of the faces one image."""
+    name = mesh.material_library
+    if not name or Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
+        problem = f"{len(mesh.materials)} materials, and {name[:80]!r} is no library inside the folder"
+        raise InputError(visual, "mtllib", problem, "Bake the mesh into one texture")
+    texture_of_materials(visual.parent / name, mesh.materials)
 
 
 def _split_seams(mesh: ObjMesh) -> tuple[np.ndarray, F32, np.ndarray]:

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.safe_files import open_regular, read_regular
+from datagen.schemas.safe_files import open_regular
 from datagen.workers.geometry.mesh import F32, I32, U8
 
 MAX_FILE_BYTES = 256 * 2**20
@@ -43,7 +43,7 @@ def read_texture(path: Path) -> U8:
                         f"Give at most {MAX_PIXELS:,} pixels",
                     )
                 image.draft("RGB", (KEPT_SIDE_PX, KEPT_SIDE_PX))
-                pixels = image.convert("RGB")
+                pixels = rgb_of(image)
                 pixels.thumbnail((KEPT_SIDE_PX, KEPT_SIDE_PX), Image.Resampling.BOX)
                 return np.asarray(pixels, np.uint8)
     except InputError:
@@ -52,6 +52,13 @@ def read_texture(path: Path) -> U8:
         raise InputError(
             path, "", f"not a readable JPEG or PNG image ({type(error).__name__})", "Fetch the asset again"
         ) from error
+
+
+def rgb_of(image: Image.Image) -> Image.Image:
+    """The image in 8-bit RGB; Pillow alone clips 16-bit grey to white."""
+    if image.mode.startswith("I"):  # "I" or "I;16", by Pillow's version
+        image = Image.fromarray((np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8))
+    return image.convert("RGB")
 
 
 def face_colours(image: U8, uv: F32, faces: I32) -> U8:
@@ -68,28 +75,3 @@ def face_colours(image: U8, uv: F32, faces: I32) -> U8:
         row = np.minimum(((1.0 - point[:, 1]) * height).astype(np.int64), height - 1)
         total += image[row, column]
     return np.rint(total / len(_SAMPLES)).astype(np.uint8)
-
-
-def texture_of_material(library: Path, materials: tuple[str, ...]) -> str:
-    """The `map_Kd` image name that a material library gives to the used materials.
-
-    Raises InputError naming the library: missing, no image, or several images on one mesh.
-    """
-    data = read_regular(library, 2**20, "Put the mesh's material library next to it")
-    images: dict[str, str] = {}
-    material = ""
-    for line in data.decode("utf-8", "replace").splitlines():
-        keyword, _, value = line.strip().partition(" ")
-        if keyword == "newmtl":
-            material = value.strip()
-        elif keyword == "map_Kd":
-            images[material] = value.strip()
-    used = {images[m] for m in materials if m in images} or set(images.values())
-    if len(used) != 1:
-        raise InputError(
-            library,
-            "map_Kd",
-            f"{len(used)} texture images for one mesh, where 1 is needed",
-            "Bake the mesh into one texture",
-        )
-    return used.pop()

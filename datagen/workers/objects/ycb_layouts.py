@@ -17,9 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.json_document import parse_json
+from datagen.workers.objects.materials import texture_of_materials
 from datagen.workers.objects.obj_file import read_obj_header
 from datagen.workers.objects.scan import ScanFiles, scan_files
-from datagen.workers.objects.texture import texture_of_material
 from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG
 
 MAX_INDEX_BYTES = 16 * 2**20
@@ -115,7 +115,7 @@ def _maniskill(folder: Path, index: Path) -> list[Entry]:
         visual = home / "textured.obj"
         header = read_obj_header(visual)
         library = _inside(home, visual, "mtllib", header.material_library or "textured.mtl")
-        image = texture_of_material(library, header.materials)
+        image = texture_of_materials(library, header.materials)
         collision = next((c for c in (home / "collision.ply", home / "collision.obj") if c.is_file()), None)
         if collision is None:
             raise InputError(

@@ -44,7 +44,9 @@ def test_written_meshes_are_read(tmp_path_factory: pytest.TempPathFactory, data:
         for k in range(1, count - 1):
             expected.append((v[0], v[k], v[k + 1]))
             expected_uv.append((t[0], t[k], t[k + 1]) if "t" in style else (-1, -1, -1))
-    end = data.draw(st.sampled_from(["\n", "\r\n"]))
+    end = data.draw(st.sampled_from(["\n", "\r\n", "\r"]))
+    if data.draw(st.booleans()):
+        lines = [line.replace(" ", data.draw(st.sampled_from(["\t", f" \\{end} "]))) for line in lines]
     path.write_bytes((end.join(lines) + data.draw(st.sampled_from(["", end]))).encode())
     mesh = read_obj(path)
     np.testing.assert_array_equal(mesh.faces, expected)
@@ -52,6 +54,7 @@ def test_written_meshes_are_read(tmp_path_factory: pytest.TempPathFactory, data:
     np.testing.assert_allclose(mesh.vertices, vertices)
     np.testing.assert_allclose(mesh.uv, uv)
     assert mesh.group_starts.tolist() == groups
+    assert mesh.materials == ()
     assert sum(len(g) for g in mesh.group_faces()) == len(expected)
 
 
@@ -146,3 +149,33 @@ def test_limits_stop_the_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     for missing in (tmp_path / "none.obj", tmp_path):
         with pytest.raises(InputError, match=r"cannot be read|is not a file"):
             read_obj(missing)
+
+
+@pytest.mark.parametrize("block_bytes", [1, 7, 64, 2**16])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_lines_are_numbered_and_joined_wherever_the_file_is_cut(
+    end: str, block_bytes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines = ["# ends in \\", "v 0 0 0", "v 1 \\", "0 \\", "0", "v\t0 1 0", "", "f 1 2 3", "f 1 2 9x"]
+    monkeypatch.setattr(obj_file, "_BLOCK_BYTES", block_bytes)
+    path = tmp_path / "mesh.obj"
+    path.write_bytes(end.join(lines[:-1]).encode())
+    mesh = read_obj(path)
+    np.testing.assert_array_equal(mesh.vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2]])
+    path.write_bytes(end.join(lines).encode())
+    with pytest.raises(InputError, match=r"line 9: .*: 'f 1 2 9x'"):
+        read_obj(path)
+
+
+def test_the_materials_are_those_of_faces(tmp_path: Path) -> None:
+    path = tmp_path / "mesh.obj"
+    path.write_text(
+        "mtllib a.mtl\nmtllib b.mtl\nusemtl none\n"
+        + HEAD
+        + "usemtl\tone two\nf 1 2 3\nusemtl last\nf 1 2 3\n"
+    )
+    mesh = read_obj(path)
+    assert (mesh.material_library, mesh.materials) == ("a.mtl", ("one two", "last"))
+    path.write_text(HEAD + "f 1 2 3\nusemtl late\n")
+    assert read_obj(path).materials == ()

@@ -186,7 +186,8 @@ BAD_MANISKILL: dict[str, tuple[Callable[[Path], object], str]] = {
     "parts broken": (_write(PLY, "ply\nformat ascii 1.0\nelement"), "collision.ply"),
     "parts claim too much": (_write(PLY, HUGE_PLY), "collision.ply"),
     "no library": (lambda f: (f / MTL).unlink(), "textured.mtl"),
-    "no image": (_write(MTL, "newmtl material_0\n"), "0 texture images"),
+    "no image": (_write(MTL, "newmtl material_0\n"), "no texture image"),
+    "no material": (_write(MTL, ""), "0 texture images"),
     "image outside": (_write(MTL, "newmtl material_0\nmap_Kd ../../../x.png\n"), "map_Kd"),
     "model missing": (lambda f: shutil.rmtree(f / "models/001_cube"), "textured.obj"),
 }
