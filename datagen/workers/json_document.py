@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from datagen.schemas.errors import InputError, printable
+from datagen.workers.foreign_files import START_BYTES, refuse_other_kind
 
 # No house is larger; a larger coordinate is a unit error or garbage.
 EXTENT_M = 1000.0
@@ -89,6 +90,7 @@ class JsonNode:
 def parse_json(text: bytes, place: str) -> JsonNode:
     """The document, or an InputError for text that is not JSON or is nested too deeply."""
     fix = "Restore the file from its source."
+    refuse_other_kind(place, text[:START_BYTES], "a JSON text", fix)
     if text.count(b"{") + text.count(b"[") > _MOST_PARTS:
         raise InputError(place, "$", f"more than {_MOST_PARTS:,} lists and objects", fix)
     try:

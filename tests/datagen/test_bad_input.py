@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 
 from tests.refusals import refused
 from tests.small_runs import CONFIG, PER_SCENE, files_of, submit_arguments
-from tests.workers.houses.house_files import two_rooms, write_houses
+from tests.workers.houses.house_files import write_houses
 
 OPTIONS: list[tuple[str, list[str]]] = [
     ("--n 0", ["--n", "0", "10^12"]),
@@ -174,23 +175,76 @@ def test_a_configuration_of_random_bytes(tmp_path: Path, capsys: pytest.CaptureF
 # Folders of houses -------------------------------------------------------------------------------
 
 
+def bare_house(**changes: Any) -> dict[str, Any]:
+    """A house of one empty room, 4 x 4 m, in ProcTHOR's own form."""
+    floor = [{"x": x, "y": 0, "z": z} for x, z in ((0, 0), (0, 4), (4, 4), (4, 0))]
+    walls = []
+    for k, (a, b) in enumerate(zip(floor, floor[1:] + floor[:1], strict=True)):
+        polygon = [a, b, {**a, "y": 2.5}, {**b, "y": 2.5}]
+        walls.append({"id": f"wall|{k}", "roomId": "room|1", "polygon": polygon})
+    room = {"id": "room|1", "roomType": "Kitchen", "floorPolygon": floor}
+    return {
+        "_id": "bare",
+        "rooms": [room],
+        "walls": walls,
+        "doors": [],
+        "windows": [],
+        "objects": [],
+    } | changes
+
+
+TABLE = {
+    "Table_1": {
+        "objectType": "DiningTable", "size": [1.2, 0.75, 0.8], "surface_height_m": 0.75,
+        "receptacle": True, "pickupable": False,
+    }
+}  # fmt: skip
+
+
+def procthor_folder(folder: Path, lines: list[str]) -> Path:
+    """Houses as ProcTHOR JSON lines beside a size table."""
+    folder.mkdir()
+    (folder / "asset_sizes.json").write_text(json.dumps(TABLE))
+    with gzip.open(folder / "houses.jsonl.gz", "wt") as file:
+        file.write("\n".join(lines) + "\n")
+    return folder
+
+
+LOW_TABLE = {
+    "id": "t", "assetId": "Table_1", "position": {"x": 1.5, "y": 0.375, "z": 1.5},
+    "rotation": {"x": 0, "y": 0, "z": 0},
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    ("houses", "word"),
+    ("lines", "words"),
     [
-        ([two_rooms() | {"objects": []}], "no_surface"),
-        ([two_rooms() | {"rooms": []}], "bad_house"),
-        ([{"_id": "x"}, b'{"_id": "y", "rooms": [[[', b"[]"], "bad_house"),
+        ([json.dumps(bare_house())], ["no_surface 7", "no support surface", "bare with no surface", "axes"]),
+        (
+            [json.dumps(bare_house(objects=[LOW_TABLE]))],
+            [
+                "no_surface 7",
+                "with surfaces at 0.75 to 0.75 m, up to 0.80 m wide, not at 0.9 to 1.2 m",
+                "scale",
+            ],
+        ),
+        ([json.dumps(bare_house(rooms=[]))], ["bad_house 7", "$.rooms: has no rooms. Correct"]),
+        (
+            [json.dumps({"_id": "x"}), '{"_id": "y", "rooms": [[[', "[]"],
+            ["bad_house 7", "houses cannot be used, as "],
+        ),
     ],
-    ids=["no receptacle", "no room", "broken JSON only"],
+    ids=["no receptacle", "low receptacle", "no room", "broken JSON only"],
 )
 def test_houses_that_give_no_scene_are_refused_with_the_causes(
-    houses: list[Any], word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    lines: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = write_houses(tmp_path / "houses", houses)
-    config = CONFIG + "\n[scene]\nmax_retries = 7\n"
+    folder = procthor_folder(tmp_path / "houses", lines)
+    config = CONFIG + "\n[scene]\nmax_retries = 7\nsupport_height_m = {low = 0.9, high = 1.2}\n"
     out = tmp_path / "run"
     arguments = submit_arguments(out, PER_SCENE, "--houses", f"procthor:{folder}", config=config)
-    refused(arguments, capsys, f"procthor:{folder}", f"{word} 7")
+    told = refused(arguments, capsys, f"procthor:{folder}", *words)
+    assert " ." not in told and ".." not in told
     assert not out.exists()
 
 

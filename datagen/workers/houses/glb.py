@@ -12,6 +12,7 @@ from PIL import Image
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
+from datagen.workers.foreign_files import refuse_other_kind
 from datagen.workers.geometry.mesh import F64, U8, Mesh
 from datagen.workers.json_document import parse_json
 from datagen.workers.objects.texture import rgb_of
@@ -42,6 +43,7 @@ def read_glb(path: Path) -> Mesh:
     import trimesh
 
     data = read_regular(path, MAX_FILE_BYTES, _FIX)
+    refuse_other_kind(path, data, "a binary glTF file", _FIX)
     _check_header(path, data)
     try:
         # From memory, so that no reference to another file is followed.

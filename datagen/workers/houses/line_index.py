@@ -22,6 +22,7 @@ from typing import IO, Any, cast
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import DAMAGED_ZIP, open_regular, whole_file
 from datagen.workers.content_cache import cache_folder, drop_unused, refresh
+from datagen.workers.foreign_files import START_BYTES, refuse_other_kind
 from datagen.workers.json_document import parse_json
 
 MAX_LINE_BYTES = 16 << 20  # the largest known house has 0.1 MB
@@ -70,8 +71,11 @@ class LineIndex:
 
 def open_lines(path: Path) -> LineIndex:
     """The index of a .jsonl or .jsonl.gz file. Raises InputError that names the file or its line."""
+    expected = "a gzip file" if path.suffix == ".gz" else "text"
     try:
         with open_regular(path, _MAX_FILE_BYTES, _FIX) as stream:
+            refuse_other_kind(path, stream.read(START_BYTES), expected, _FIX)
+            stream.seek(0)
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
         packed = cache_folder() / "houses" / f"{digest}-v{_FORMAT}.zip"
         return _opened(path, packed) or _opened(path, _packed(path, packed)) or _in_memory(path)

@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
+from datagen.workers.foreign_files import START_BYTES, refuse_other_kind
 from datagen.workers.geometry.mesh import F32, F64, vertex_components
 from datagen.workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
 
@@ -113,6 +114,7 @@ def _read_ply(path: Path) -> tuple[F64, list[npt.NDArray[np.int64]]]:
     import trimesh
 
     data = read_regular(path, MAX_FILE_BYTES, "Give a PLY file of a simplified mesh")
+    refuse_other_kind(path, data[:START_BYTES], "a PLY file", "Export the parts as PLY")
     try:
         mesh = trimesh.load_mesh(io.BytesIO(data), file_type="ply", process=False)
         vertices = np.asarray(mesh.vertices, np.float64)

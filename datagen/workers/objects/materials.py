@@ -9,6 +9,7 @@ from pathlib import Path
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
+from datagen.workers.foreign_files import refuse_other_kind
 
 _MAX_BYTES = 2**20
 _BAKE = "Bake the mesh into one texture"
@@ -34,6 +35,7 @@ def texture_of_materials(library: Path, used: Sequence[str]) -> str:
     Raises InputError naming the library: missing, or a material with a colour alone, or with another image.
     """
     data = read_regular(library, _MAX_BYTES, "Put the mesh's material library next to it")
+    refuse_other_kind(library, data, "text", _BAKE)
     images: dict[str, str] = {}
     material = ""
     for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from datagen.schemas.errors import InputError, printable
 from datagen.schemas.safe_files import open_regular
+from datagen.workers.foreign_files import START_BYTES, refuse_other_kind
 from datagen.workers.geometry.mesh import F64
 
 I64 = npt.NDArray[np.int64]
@@ -162,6 +163,9 @@ def _pieces(path: Path) -> Iterator[tuple[int, str, bytes]]:
 def _blocks(path: Path) -> Iterator[bytes]:
     """The file in blocks of whole lines, each with \\n at its end, continued lines in one block."""
     with open_regular(path, MAX_FILE_BYTES, "Give a text OBJ file of a simplified mesh") as file:
+        fix = "Export the mesh as text OBJ"
+        refuse_other_kind(path, file.read(START_BYTES), "text", fix)
+        file.seek(0)
         rest = b""
         while block := file.read(_BLOCK_BYTES):
             block = rest + block

@@ -10,6 +10,7 @@ from PIL import Image
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import open_regular
+from datagen.workers.foreign_files import START_BYTES, refuse_other_kind
 from datagen.workers.geometry.mesh import F32, I32, U8
 
 MAX_FILE_BYTES = 256 * 2**20
@@ -18,6 +19,7 @@ MAX_PIXELS = 8192 * 8192
 # Larger images are reduced to this side; a 640x480 frame shows no finer detail of an object.
 KEPT_SIDE_PX = 512
 
+_IMAGES = (b"\x89PNG", b"\xff\xd8\xff")
 # Barycentric points at which a face's colour is sampled: its centre and half way to each corner.
 _SAMPLES = np.array([[2, 2, 2], [4, 1, 1], [1, 4, 1], [1, 1, 4]], np.float64) / 6
 
@@ -31,6 +33,10 @@ def read_texture(path: Path) -> U8:
     file = open_regular(path, MAX_FILE_BYTES, "Put a smaller image there, or fetch the asset again")
     try:
         with file, warnings.catch_warnings():
+            start = file.read(START_BYTES)
+            file.seek(0)
+            if not start.startswith(_IMAGES):
+                refuse_other_kind(path, start, "an image", "Save the texture as JPEG or PNG")
             # Our own limit, checked below, is stricter than the one that warns.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(file, formats=("JPEG", "PNG")) as image:

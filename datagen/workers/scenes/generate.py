@@ -25,6 +25,7 @@ from datagen.workers.rendering.visibility import visible_pixels
 from datagen.workers.scenes import Scene
 from datagen.workers.scenes.placement import (
     SceneRejected,
+    describe_surfaces,
     drop_poses,
     eligible_surfaces,
     nearby_parts,
@@ -36,26 +37,52 @@ from datagen.workers.world import PreparedHouse, World
 # Objects that roll off the support touch no static part farther from it than this.
 _SURROUNDINGS_M = 0.3
 
+_OBJECTS = "Check masses, scale and collision parts of the objects"
+# What each cause of a rejection means, and what may help where it is the most frequent.
+_CAUSES = {
+    "bad_house": ("houses cannot be used", "Correct or remove them; `submit --dry-run` names each"),
+    "no_surface": (
+        "houses have no support surface of the specified height and size",
+        "Check scale and axes of the houses, or widen scene.support_height_m",
+    ),
+    "no_placement": (
+        "target and clutter find no free place on the surface",
+        "Use smaller objects or less clutter (scene.n_clutter)",
+    ),
+    "not_at_rest": ("objects still move after the last step", _OBJECTS),
+    "fell_off": ("objects leave their support", _OBJECTS),
+    "penetration": ("objects end inside others", _OBJECTS),
+    "not_finite": ("the physics returns no finite poses", _OBJECTS),
+    "no_viewpoint": (
+        "no free viewpoint sees enough of the target",
+        "Widen observation.distance_m, or use houses with more free floor",
+    ),
+    "no_base": (
+        "no candidate base pose around the target is clear or within reach",
+        "Use --candidates grid, or widen candidates.arm_reach_m",
+    ),
+}
+
 
 def generate_scene(world: World, index: int, clock: StageClock) -> tuple[Scene, SceneCandidates]:
     """Sample scene `index` of the specification and its candidates: the first accepted try.
 
     Raises InputError after `scene.max_retries` rejections.
     """
-    redraws, detail = Counter[str](), ""
+    redraws, details = Counter[str](), dict[str, str]()
     for retry in range(world.spec.scene.max_retries):
         try:
             return _try_scene(world, index, retry, dict(redraws), clock)
         except SceneRejected as rejection:
             redraws[rejection.cause] += 1
-            detail = rejection.detail or detail
-    causes = ", ".join(f"{cause} {count}" for cause, count in redraws.most_common())
-    raise InputError(
-        f"scene {index}",
-        "scene.max_retries",
-        f"no usable scene in {world.spec.scene.max_retries} tries ({causes}) {detail}",
-        "Check the most frequent cause: other houses or objects, or wider limits, may help",
-    )
+            if rejection.detail:
+                details[rejection.cause] = rejection.detail
+    most = redraws.most_common(1)[0][0]
+    counts = ", ".join(f"{cause} {count}" for cause, count in redraws.most_common())
+    why, fix = _CAUSES[most]
+    example = f", as {details[most]}" if most in details else ""
+    problem = f"no usable scene in {world.spec.scene.max_retries} tries ({counts}): {why}{example}"
+    raise InputError(f"scene {index}", "scene.max_retries", problem, fix)
 
 
 def _try_scene(
@@ -67,7 +94,7 @@ def _try_scene(
         house = _load_house(world, world.house_ids[rng.integers(len(world.house_ids))])
         surfaces = eligible_surfaces(house.house, spec.scene)
         if not surfaces:
-            raise SceneRejected("no_surface")
+            raise SceneRejected("no_surface", describe_surfaces(house.house, spec.scene))
         surface = surfaces[rng.integers(len(surfaces))]
         names = _draw_names(world, rng, clock)
         models = tuple(world.object(name) for name in names)
@@ -105,7 +132,8 @@ def _load_house(world: World, house_id: str) -> PreparedHouse:
     try:
         return world.house(house_id)
     except InputError as error:
-        raise SceneRejected("bad_house", str(error)) from error
+        where = f"{error.place}: {error.field}" if error.field else error.place
+        raise SceneRejected("bad_house", f"{where}: {error.problem}") from error
 
 
 def _draw_names(world: World, rng: np.random.Generator, clock: StageClock) -> list[str]:

@@ -41,6 +41,17 @@ def eligible_surfaces(house: House, params: SceneParams) -> list[Surface]:
     return [s for s in house.surfaces if low <= s.height_m <= high and min(s.size_m) >= 0.3]
 
 
+def describe_surfaces(house: House, params: SceneParams) -> str:
+    """The surfaces of a house without an eligible one, for an error: their heights and sizes."""
+    wanted = params.support_height_m
+    found = "no surface"
+    if house.surfaces:
+        heights_m = [surface.height_m for surface in house.surfaces]
+        widest_m = max(min(surface.size_m) for surface in house.surfaces)
+        found = f"surfaces at {min(heights_m):.2f} to {max(heights_m):.2f} m, up to {widest_m:.2f} m wide"
+    return f"{house.house_id} with {found}, not at {wanted.low:g} to {wanted.high:g} m and 0.3 m wide"
+
+
 def standing_footprints(house: House, surface: Surface) -> list[F64]:
     """Convex footprints (K, 2), surface frame, of parts that rise above the surface."""
     T = surface.T_world_surface

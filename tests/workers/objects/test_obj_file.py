@@ -112,7 +112,7 @@ BAD = {
     "mixed corners": (HEAD + "f 1/1 2 3/1\n", "line 5"),
     "huge index": (HEAD + "f 1 2 99999999999999999999999\n", "line 5"),
     "texture NaN": (HEAD + "vt nan 0\nf 1/1 2/1 3/1\n", "line 5"),
-    "binary": ("\x00\x01\x02" * 50, "no faces"),
+    "binary": ("\x00\x01\x02" * 50, "is a binary file"),
 }
 
 
