@@ -44,6 +44,16 @@ def textured_box(size: tuple[float, float, float], rgb: tuple[int, int, int]):
     return mesh
 
 
+def instance(name: str, at: tuple[float, float, float], rotation: tuple = (1, 0, 0, 0), **more: Any) -> dict:
+    return {"template_name": f"objects/{name}", "translation": list(at), "rotation": list(rotation), **more}
+
+
+def floor_at(height: float) -> trimesh.Trimesh:
+    mesh = floor(0, 4, 0, 3, (200, 200, 200))
+    mesh.apply_translation((0, height, 0))
+    return mesh
+
+
 def export(path: Path, meshes: list[trimesh.Trimesh]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(trimesh.Scene(meshes).export(file_type="glb"))
