@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NoReturn, Protocol
 
@@ -82,25 +83,42 @@ def run_training(
     at, clock = training.position, _Clock()
     training.model.train()
     kept_s = time.monotonic()
-    while not at.finished:
-        wait_began_s = time.perf_counter()
-        for batch in training.train.epoch(at.epoch, at.batch):
-            clock.waited_from(wait_began_s)
-            stop = stopping()
-            step = _step(training, batch, clock)
-            for callback in callbacks:
-                callback.step(step)
-            if stop or time.monotonic() - kept_s >= save_every_s:
-                save()
-                kept_s = time.monotonic()
-            if stop:
-                return False
+    with _repeatable(training.model.device):
+        while not at.finished:
             wait_began_s = time.perf_counter()
-        record = _end_epoch(training, clock)
-        for callback in callbacks:
-            callback.epoch(record)
-        save()
+            for batch in training.train.epoch(at.epoch, at.batch):
+                clock.waited_from(wait_began_s)
+                stop = stopping()
+                step = _step(training, batch, clock)
+                for callback in callbacks:
+                    callback.step(step)
+                if stop or time.monotonic() - kept_s >= save_every_s:
+                    save()
+                    kept_s = time.monotonic()
+                if stop:
+                    return False
+                wait_began_s = time.perf_counter()
+            record = _end_epoch(training, clock)
+            for callback in callbacks:
+                callback.epoch(record)
+            save()
     return True
+
+
+@contextmanager
+def _repeatable(device: torch.device) -> Generator[None]:
+    """Let operations on a CPU give the same bits each time; the process is then as it was before.
+
+    By default threads add the gradients of rows that `x[rows]` repeats in the order in which they come.
+    Operations that cannot repeat warn instead of failing: a model of the user may have them.
+    """
+    before = torch.get_deterministic_debug_mode()
+    if device.type == "cpu":
+        torch.set_deterministic_debug_mode(max(before, 1))
+    try:
+        yield
+    finally:
+        torch.set_deterministic_debug_mode(before)
 
 
 def _step(training: Training, batch: Batch[Array], clock: _Clock) -> TrainingStep:
