@@ -1,46 +1,158 @@
-"""What tests of checks share: a sealed run of two shards, what checks find in it, and records edited."""
+"""What tests of stores share: schemas of few arrays, stored rows, findings of checks, and edited records."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
+from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import zarr
+from obstore.store import from_url
+from zarr.storage import ObjectStore
+
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
+from datagen.schemas.fields import SCHEMAS, RecordSchema
+from datagen.schemas.merging import MergeResult, merge_runs, plan_merge
+from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.record_files import signed_json
-from datagen.schemas.run import Run
-from datagen.schemas.run_records import Cost, LedgerEntry
-from datagen.schemas.sealing import seal
-from datagen.schemas.storage import open_storage
-from tests.made_runs import make_run
+from datagen.schemas.run import Run, open_runs
+from datagen.schemas.run_records import Commit, Cost, LedgerEntry
+from datagen.schemas.sealing import seal, store_record
+from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.storage import Storage, open_storage
+from tests.made_runs import Tables, attempt, commit_of, make_run, rows_of, small_spec
+
+Arrays = dict[str, np.ndarray[Any, Any]]
+
+# Names, text, a vector and a cloud; both tables; all that checks compare with other records.
+FEW = (
+    *("scene_index", "redraws", "house_id", "points_m"),
+    *("sample_id", "sample_scene_index", "candidate_index", "label", "distance_m"),
+)
+_HEURISTIC = SCHEMAS["heuristic"]
 
 
-def check(folder: Path) -> tuple[list[Finding], Checked]:
-    checked = Checked()
-    return list(check_runs(open_storage(folder, probe=False, create=False), checked)), checked
-
-
-def found(folder: Path) -> list[tuple[str, str]]:
-    """(kind, file) of every finding."""
-    return [(f.kind, f.key) for f in check(folder)[0]]
-
-
-def edit(path: Path, **changes: Any) -> None:
-    """Change a record and sign it anew, as one who knows the format would."""
-    record = json.loads(path.read_text())
-    del record["sha256"]
-    path.write_bytes(signed_json(record | changes))
-
-
-def sealed_run(folder: Path) -> Run:
-    """A sealed run of two shards and one failed attempt."""
-    run = make_run(folder, 19)
-    run.ledger.end(LedgerEntry(attempt="x-1", shard=1, outcome="crashed", cost=Cost(wall_s=2, cpu_s=1)))
-    seal(run.storage)
-    return run
+def few_fields() -> RecordSchema:
+    """The heuristic schema with few fields."""
+    scenes, samples = (
+        tuple(f for f in fields if f.name in FEW)
+        for fields in (_HEURISTIC.scene_fields, _HEURISTIC.sample_fields)
+    )
+    return replace(_HEURISTIC, scene_fields=scenes, sample_fields=samples)
 
 
 def folder_of(run: Run) -> Path:
     assert run.storage.folder is not None
     return run.storage.folder
+
+
+# Runs ----------------------------------------------------------------------------------------
+
+
+def sealed_run(folder: Path | str, n: int = 19) -> Run:
+    """A sealed run of shards of two scenes, with one failed attempt."""
+    run = make_run(folder, n)
+    run.ledger.end(LedgerEntry(attempt="x-1", shard=1, outcome="crashed", cost=Cost(wall_s=2, cpu_s=1)))
+    seal(run.storage)
+    return run
+
+
+def fill(
+    folder: Path | str, who: str, shards: Iterable[int], n: int = 60, size: int = 2, seed: int = 0
+) -> Run:
+    """A run below a folder, with attempts of its own names."""
+    run = make_run(f"{folder}/{who}", n, size, shards=[], spec=small_spec(seed))
+    for shard in shards:
+        assert attempt(run, shard, f"{shard:06d}-{who}-{size}")
+    return run
+
+
+def resume(storage: Storage) -> None:
+    """Make the missing shards, as `datagen resume` does, and seal."""
+    for run in open_runs(storage):
+        for shard in run.missing():
+            assert attempt(run, shard, f"again-{shard}-{run.layout.scenes_per_shard}")
+    seal(storage)
+
+
+def merge(folder: Path | str, names: Iterable[str], out: str = "out") -> MergeResult:
+    return merge_runs(plan_merge([f"{folder}/{name}" for name in names], f"{folder}/{out}"))
+
+
+def commit_object(run: Run, shard: int, data: bytes, name: str = "f", **changes: Any) -> Commit:
+    """Commit any bytes as a shard's object, with the sums of the rows that the shard should have."""
+    scenes, samples = rows_of(run, shard)
+    sums = dict(zip(REDRAW_CAUSES, scenes["redraws"].sum(axis=0).tolist(), strict=True))
+    redraws = {cause: count for cause, count in sums.items() if count}
+    run.ledger.start(name, shard)
+    entry = run.write_object(name, data)
+    commit = commit_of(run, shard, name, entry, int(samples["label"].sum()), redraws)
+    commit = commit.model_copy(update=changes)
+    assert run.commit(commit)
+    return commit
+
+
+def encoded(run: Run, tables: Tables) -> bytes:
+    return encode_shard(run.schema, run.layout, run.manifest.spec_hash, *tables)
+
+
+def edit(path: Path, **changes: Any) -> None:
+    """Change a record and sign it again, as a program that knows the format would."""
+    record = json.loads(path.read_text())
+    del record["sha256"]
+    path.write_bytes(signed_json(record | changes))
+
+
+# Rows ----------------------------------------------------------------------------------------
+
+
+def expected(shards: Iterable[tuple[Run, int]], scenes: int | None = None, n: int | None = None) -> Arrays:
+    """The rows that shards were given, one after the other, cut to so many scenes and samples."""
+    tables = [rows_of(run, shard) for run, shard in shards]
+    return {
+        name: np.concatenate([each[t][name] for each in tables])[:rows]
+        for t, rows in ((0, scenes), (1, n))
+        for name in tables[0][t]
+    }
+
+
+def stored(storage: Storage) -> Arrays:
+    """Every array of the sealed store that counts, read by zarr alone; each of its files is as recorded."""
+    record = store_record(storage)
+    assert record is not None
+    for entry in record.files:
+        data = storage.get(f"{record.name}/{entry.path}", entry.size)
+        assert data is not None and sha256(data).hexdigest() == entry.sha256, entry.path
+    assert len(list(storage.list(record.name))) == len(record.files)
+    path = f"{storage.url}/{record.name}"
+    store = path if storage.folder else ObjectStore(from_url(path), read_only=True)
+    return {name: np.asarray(array[:]) for name, array in zarr.open_group(store, mode="r").arrays()}
+
+
+def assert_rows(found: Arrays, wanted: Arrays) -> None:
+    assert found.keys() == wanted.keys()
+    for name, values in wanted.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+def tree(storage: Storage) -> dict[str, bytes | None]:
+    """Every file of a storage."""
+    return {file.key: storage.get(file.key, 2**30) for file in storage.list("")}
+
+
+# Checks --------------------------------------------------------------------------------------
+
+
+def check(place: Path | str) -> tuple[list[Finding], Checked]:
+    checked = Checked()
+    return list(check_runs(open_storage(place, probe=False, create=False), checked)), checked
+
+
+def found(place: Path | str) -> list[tuple[str, str]]:
+    """(kind, file) of every finding."""
+    return [(f.kind, f.key) for f in check(place)[0]]

@@ -1,4 +1,4 @@
-"""A real small disk, to fill."""
+"""A real small disk, to fill, and runs of few arrays."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from datagen.schemas.fields import SCHEMAS
+from tests.schemas.checked import few_fields
 
 
 @pytest.fixture
@@ -22,3 +25,11 @@ def tiny_disk(tmp_path: Path) -> Iterator[Path]:
         yield folder
     finally:
         subprocess.run(["umount", str(folder)], check=True)
+
+
+@pytest.fixture(scope="module")
+def few_arrays() -> Iterator[None]:
+    """Heuristic runs of few arrays: stores of fifty take the same paths."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(SCHEMAS, "heuristic", few_fields())
+        yield

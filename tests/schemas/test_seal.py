@@ -1,27 +1,81 @@
-"""The sealed store: what stock libraries read is what was committed."""
+"""The sealed store: what stock libraries read is what was committed, and only whole stores count."""
 
 from __future__ import annotations
 
-import errno
-import json
-import os
 import subprocess
 import threading
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray
 import zarr
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from datagen.schemas import shard_files
-from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.errors import InputError
-from datagen.schemas.run import Run
-from datagen.schemas.sealing import SEALED, seal
+from datagen.schemas.run import Run, open_runs
+from datagen.schemas.run_records import Layout
+from datagen.schemas.sealing import seal, store_record
+from datagen.schemas.shard_sources import ZipFiles
 from datagen.schemas.specification import Source
-from tests.made_runs import check_digests, files_of, make_run, rows_of, small_spec, write
+from datagen.schemas.storage import Storage, open_storage
+from datagen.train.run_parts import open_parts
+from tests.made_runs import attempt, files_of, make_run, manifest_of, small_spec, write
+from tests.schemas.checked import assert_rows, check, expected, fill, folder_of, found, merge, stored, tree
+
+
+def of(run: Run, *shards: int) -> list[tuple[Run, int]]:
+    return [(run, shard) for shard in shards]
+
+
+# What a store holds ---------------------------------------------------------------------------
+
+
+def test_zarr_and_xarray_read_every_row_in_order_with_dimensions_and_units(tmp_path: Path) -> None:
+    run = make_run(tmp_path, n=43, shards=[4, 0, 2, 1, 3])
+    assert seal(run.storage) == f"{tmp_path}/data.zarr"
+    wanted = expected(of(run, 0, 1, 2, 3, 4), 9, 43)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert_rows(stored(run.storage), wanted)
+        data = xarray.open_zarr(f"{tmp_path}/data.zarr", chunks=None).load()
+    assert_rows({str(name): data[name].values for name in data.variables}, wanted)
+    assert (data.sizes["scene"], data.sizes["sample"]) == (9, 43)
+    for table, f in run.schema.fields:
+        assert data[f.name].dims == (table, *f.dims)
+        assert (data[f.name].attrs.get("units", ""), data[f.name].attrs["long_name"]) == (f.unit, f.doc)
+    (part,) = data.attrs["parts"]
+    assert data.attrs["spec_hash"] == part["spec_hash"] == run.manifest.spec_hash
+    assert part["specification"] == run.manifest.spec.document()
+    assert (part["n"], part["samples"], part["missing"]) == (43, 43, [])
+
+
+def test_a_store_states_conventions_source_licences_and_coordinates(tmp_path: Path) -> None:
+    sources = {
+        "houses": Source(kind="procthor", digest="1" * 64),
+        "objects": Source(kind="ycb", digest="2" * 64),
+    }
+    spec = small_spec().model_copy(update=sources)
+    data = xarray.open_zarr(seal(make_run(tmp_path, n=13, spec=spec).storage), chunks=None)
+    told = data.attrs
+    assert told["Conventions"] == "CF-1.11, ACDD-1.3"
+    assert told["title"] == "Robot base poses labelled by heuristic, in ProcTHOR houses with YCB objects"
+    assert told["license"] == "ProcTHOR houses: Apache-2.0; YCB objects: CC-BY-4.0"
+    assert "arXiv:2206.06994" in told["references"] and "Calli" in told["acknowledgement"]
+    assert f"objects ycb sha256 {'2' * 64}" in told["source"] and "datagen.candidates" in told["comment"]
+    assert (
+        told["history"].startswith("datagen submit heuristic --n 13, seed 0")
+        and spec.hash() in told["history"]
+    )
+    assert set(data.coords) == {
+        "scene_index", "house_id", "sample_scene_index", "candidate_index", "robot_index",
+    }  # fmt: skip
+    assert data["label"].encoding["coordinates"] == "sample_scene_index candidate_index robot_index"
 
 
 def clear_metadata() -> None:
@@ -29,286 +83,294 @@ def clear_metadata() -> None:
     shard_files._made_by_zarr.cache_clear()
 
 
-def expected(run: Run, shards: list[int], scenes: int, samples: int) -> dict[str, np.ndarray]:
-    tables = [rows_of(run, shard) for shard in shards]
-    out: dict[str, np.ndarray] = {}
-    for t, rows in ((0, scenes), (1, samples)):
-        out |= {k: np.concatenate([each[t][k] for each in tables])[:rows] for k in tables[0][t]}
-    return out
+@pytest.mark.usefixtures("few_arrays")
+def test_chunks_of_shards_lie_unchanged_in_files_of_several(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shard_files, "MAX_CHUNK_BYTES", 1000)  # real clouds would take gigabytes
+    monkeypatch.setattr(shard_files, "_FILE_BYTES", {True: 2000, False: 2000})
+    clear_metadata()
+    try:
+        run = make_run(tmp_path, n=75, scenes_per_shard=6)
+        seal(run.storage)
+        assert_rows(stored(run.storage), expected(of(run, 0, 1, 2), 15, 75))
+        group = zarr.open_group(tmp_path / "data.zarr", mode="r")
+        assert (group["points_m"].chunks[0], group["points_m"].shards[0]) == (2, 4)
+        files = files_of(tmp_path / "data.zarr")
+        assert {f"points_m/c.{k}.0.0" for k in range(4)} == {
+            key for key in files if key.startswith("points_m/c.")
+        }
+        for commit in run.commits():
+            place = ZipFiles("", run.read_object(commit))
+            first = 3 * commit.shard
+            for k, path in enumerate(path for path in place.paths if path.startswith("points_m/c.")):
+                assert 2 * (first + k) >= 15 or place.get(path) in files[f"points_m/c.{(first + k) // 2}.0.0"]
+        (part,) = open_parts([tmp_path / "data.zarr"], ["points_m", "label"])
+        values = [place.read(part.arrays.values()) for place in part.shards]
+        wanted = expected(of(run, 0, 1, 2), 15, 75)
+        for name in ("points_m", "label"):
+            np.testing.assert_array_equal(np.concatenate([each[name] for each in values]), wanted[name])
+    finally:
+        clear_metadata()
 
 
-def assert_equal(group: zarr.Group, arrays: dict[str, np.ndarray]) -> None:
-    assert set(group.array_keys()) == set(arrays)
-    for name, values in arrays.items():
-        np.testing.assert_array_equal(group[name][:], values, err_msg=name)
-
-
-def test_stock_zarr_reads_every_row_in_order(tmp_path: Path):
-    run = make_run(tmp_path, n=43, shards=[4, 0, 2, 1, 3])
-    path = seal(run.storage)
-    assert path == str(tmp_path / SEALED)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        group = zarr.open(path, mode="r")
-        assert_equal(group, expected(run, [0, 1, 2, 3, 4], 9, 43))
-    assert group.attrs["spec_hash"] == run.manifest.spec_hash
-    assert group.attrs["specification"] == run.manifest.spec.model_dump(mode="json")
-    assert (group.attrs["n"], group.attrs["missing_shards"]) == (43, [])
-
-
-def test_stock_xarray_reads_dimensions_units_and_values_without_a_warning(tmp_path: Path):
-    run = make_run(tmp_path, n=43)
-    path = seal(run.storage)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        data = xarray.open_zarr(path, chunks=None)
-        loaded = data.load()
-    assert (data.sizes["scene"], data.sizes["sample"]) == (9, 43)
-    for name, values in expected(run, [0, 1, 2, 3, 4], 9, 43).items():
-        np.testing.assert_array_equal(loaded[name].values, values, err_msg=name)
-    for table, fields in (("scene", run.schema.scene_fields), ("sample", run.schema.sample_fields)):
-        for f in fields:
-            assert data[f.name].dims == (table, *f.dims)
-            assert data[f.name].attrs.get("units", "") == f.unit
-            assert data[f.name].attrs["long_name"] == f.doc
-
-
-def test_missing_shards_are_packed_and_named(tmp_path: Path):
+@pytest.mark.usefixtures("few_arrays")
+def test_missing_shards_are_left_out_and_named_also_of_a_trillion(tmp_path: Path) -> None:
     run = make_run(tmp_path, n=48, shards=[1, 4])
-    group = zarr.open(seal(run.storage), mode="r")
-    assert_equal(group, expected(run, [1, 4], 4, 18))
-    assert group.attrs["missing_shards"] == [0, 2, 3]
-
-
-def test_sealing_again_after_growth_replaces_the_store(tmp_path: Path):
-    run = make_run(tmp_path, n=13)
     seal(run.storage)
-    grown = make_run(tmp_path, n=37)
-    assert_equal(zarr.open(seal(grown.storage), mode="r"), expected(grown, [0, 1, 2, 3], 8, 37))
-    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(SEALED)] == [SEALED]
+    assert_rows(stored(run.storage), expected(of(run, 1, 4), 4, 18))
+    run.grow(10**12)
+    seal(run.storage)
+    record = store_record(run.storage)
+    assert record is not None and record.parts[0].samples == 20
+    assert record.parts[0].missing == ((0, 1), (2, 4), (5, 10**11))
 
 
-def test_chunks_are_links_that_cannot_be_written(tmp_path: Path):
-    run = make_run(tmp_path, n=20)
-    path = seal(run.storage)
-    linked, own = Path(path) / "label" / "c.1", tmp_path / "shards/000001/a-1/label/c.0"
-    assert linked.samefile(own)
-    assert own.stat().st_mode & 0o777 == 0o444
+@pytest.mark.usefixtures("few_arrays")
+def test_parts_follow_each_other_and_only_the_end_is_cut(tmp_path: Path) -> None:
+    for seed, (who, shards) in enumerate({"a": [0, 1, 2], "b": [0, 2], "c": [0, 1, 2], "d": []}.items()):
+        fill(tmp_path, who, shards, n=23, seed=seed)
+    merge(tmp_path, "abcd")
+    storage = open_storage(tmp_path / "out")
+    runs = open_runs(storage)
+    full = [run for run in runs if run.committed()]
+    each = [expected(of(run, *sorted(run.committed())), 2 * len(run.committed()) - 1) for run in full]
+    wanted = {name: np.concatenate([rows[name] for rows in each]) for name in each[0]}
+    is_scene = {f.name for f in runs[0].schema.scene_fields}
+    samples = {
+        name: np.concatenate([r[name][: 5 * len(r["scene_index"])] for r in each])[:-2] for name in wanted
+    }
+    assert_rows(
+        stored(storage), {name: wanted[name] if name in is_scene else samples[name] for name in wanted}
+    )
+    record = store_record(storage)
+    assert record is not None
+    told = [(part.spec_hash, part.n, len(part.missing)) for part in record.parts]
+    assert told == [(run.manifest.spec_hash, 23, len(run.committed()) < 3) for run in runs]
+    parts = zarr.open_group(tmp_path / "out" / "data.zarr", mode="r").attrs["parts"]
+    assert [part["specification"]["seed"] for part in parts] == [run.manifest.spec.seed for run in runs]
+    assert not list((tmp_path / "out" / "parts").rglob("data*"))
 
 
-def test_nothing_committed_and_damaged_shards_are_refused_and_leave_the_old_store(tmp_path: Path):
+@pytest.mark.usefixtures("few_arrays")
+def test_nothing_committed_and_damaged_shards_are_refused_and_leave_the_old_store(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no shard is committed"):
         seal(make_run(tmp_path / "empty", shards=[]).storage)
     run = make_run(tmp_path / "run", n=20)
-    before = files_of(Path(seal(run.storage)))
-    (tmp_path / "run/shards/000001/a-1/rgb/c.0.0.0").unlink()
-    with pytest.raises(InputError, match=r"rgb/c\.0\.0\.0: is missing"):
-        seal(run.storage)
-    assert files_of(tmp_path / "run" / SEALED) == before
-
-
-def test_runs_of_more_shards_than_a_store_can_name_are_refused(tmp_path: Path):
-    run = make_run(tmp_path, n=20, shards=[0])
     seal(run.storage)
-    run.grow(10**12)
-    with pytest.raises(InputError, match="99999999999 planned shards are missing"):
-        seal(run.storage)
-    root = tmp_path / SEALED / "zarr.json"
-    told = json.loads(root.read_bytes())
-    told["attributes"] |= {"n": 10**12, "missing_shards": []}
-    root.chmod(0o644)
-    root.write_text(json.dumps(told))
-    findings = list(check_runs(run.storage, Checked()))
-    assert [(f.key, f.kind) for f in findings] == [(f"{SEALED}/zarr.json", "sealed")]
-    assert "names 100000000000 shards" in findings[0].problem
-
-
-def test_a_commit_that_lists_other_files_is_refused(tmp_path: Path):
-    run = make_run(tmp_path, n=20, shards=[0])
-    commit = write(run, 1, "b")
-    assert run.commit(commit.model_copy(update={"files": commit.files[:-1]}))
-    with pytest.raises(InputError, match="1 files are missing or extra"):
-        seal(run.storage)
-
-
-def test_what_a_killed_seal_leaves_does_not_disturb(tmp_path: Path):
-    run = make_run(tmp_path, n=20)
-    (tmp_path / f"{SEALED}.0123.partial" / "label").mkdir(parents=True)
-    assert_equal(zarr.open(seal(run.storage), mode="r"), expected(run, [0, 1], 4, 20))
-    assert Run.open(tmp_path).committed() == {0, 1}
-
-
-def test_large_clouds_in_several_chunks_a_shard(tmp_path: Path):
-    run = make_run(tmp_path, n=1, scenes_per_shard=6, shards=[])
-    patch = pytest.MonkeyPatch()
-    with patch.context() as m:
-        m.setattr(shard_files, "MAX_CHUNK_BYTES", 1000)  # real clouds would take gigabytes
-        clear_metadata()
-        run.grow(75)
-        for shard in run.missing():
-            assert run.commit(write(run, shard, "a"))
-        group = zarr.open(seal(run.storage), mode="r")
-        assert_equal(group, expected(run, [0, 1, 2], 15, 75))
-        assert group["points_m"].chunks[0] == 2
-    clear_metadata()
-
-
-def test_labels_of_random_clouds_fit_the_budget(tmp_path: Path):
-    """180,000 labels in 400 MB is 2,222 bytes each; random clouds are the worst case."""
-    spec = small_spec(n_points=4096)
-    make_run(tmp_path, n=600, scenes_per_shard=10, candidates_per_scene=60, spec=spec)
-    total = sum(p.stat().st_size for p in (tmp_path / "shards").rglob("*") if p.is_file())
-    assert total / 600 < 400e6 / 180_000
-
-
-def test_a_disk_that_fills_up_keeps_what_is_committed_and_goes_on_with_room(tiny_disk: Path):
-    run = make_run(tiny_disk, n=1, shards=[])
-    run.grow(300)
-    with pytest.raises(InputError, match=r"No space left on device\. Free disk space") as e:
-        for shard in run.missing():
-            assert run.commit(write(run, shard, "a"))
-    assert "\n" not in str(e.value)
-    done = sorted(run.committed())
-    for commit in Run.open(tiny_disk).commits():
-        check_digests(run, commit)
-    with pytest.raises(InputError, match="No space left on device"):
-        seal(run.storage)
-    assert [p.name for p in tiny_disk.iterdir() if p.name.startswith(SEALED)] == []
-    subprocess.run(["mount", "-o", "remount,size=64m", str(tiny_disk)], check=True)
-    for shard in run.missing()[:2]:
-        assert run.commit(write(run, shard, "b"))
-    group = zarr.open(seal(run.storage), mode="r")
-    shards = [*done, len(done), len(done) + 1]
-    assert_equal(group, expected(run, shards, 2 * len(shards), 10 * len(shards)))
-
-
-def test_two_jobs_that_seal_at_the_same_time_leave_one_whole_store(tmp_path: Path):
-    """As when two drivers of one run see its last commit together."""
-    run = make_run(tmp_path, n=20)
-    seal(run.storage)
-    renames: list[Path] = []
-    plain = Path.rename
-
-    def rename(path: Path, target: Path) -> Path:
-        if target == tmp_path / SEALED and not renames:
-            renames.append(path)
-            seal(Run.open(tmp_path).storage)  # the other one, between this one's two steps
-        return plain(path, target)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Path, "rename", rename)
-        seal(run.storage)
-    assert renames
-    assert_equal(zarr.open_group(tmp_path / SEALED, mode="r"), expected(run, [0, 1], 4, 20))
-    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(SEALED)] == [SEALED]
-
-
-def test_readers_find_a_whole_store_while_it_is_sealed_again_and_again(tmp_path: Path):
-    """One exchange of names: there is no moment without a store."""
-    run = make_run(tmp_path, n=20)
-    seal(run.storage)
-    done, failures, opened = threading.Event(), list[BaseException](), 0
-
-    def reader() -> None:
-        nonlocal opened
-        while not done.is_set():
-            try:
-                root = (tmp_path / SEALED / "zarr.json").read_bytes()
-                assert b"consolidated_metadata" in root
-                opened += 1
-            except (OSError, AssertionError) as e:
-                failures.append(e)
-                return
-
-    thread = threading.Thread(target=reader)
-    thread.start()
-    try:
-        for _ in range(10):
+    run.grow(30)
+    assert attempt(run, 2, "a-2")
+    for damage in (lambda p: p.write_bytes(p.read_bytes()[:-1] + b"x"), Path.unlink):
+        damage(tmp_path / "run/shards/a-2.zip")
+        before = files_of(tmp_path / "run")
+        with pytest.raises(InputError, match=r"a-2\.zip: (no such file|has \d+ bytes with another)"):
             seal(run.storage)
-    finally:
-        done.set()
-        thread.join()
-    assert failures == [] and opened > 10
+        assert files_of(tmp_path / "run") == before
 
 
-def test_where_names_cannot_be_exchanged_two_renames_do(tmp_path: Path):
+@pytest.mark.usefixtures("few_arrays")
+@pytest.mark.parametrize("kind", ["file", "link"])
+def test_a_file_or_a_link_in_the_place_of_a_store_is_refused(tmp_path: Path, kind: str) -> None:
+    run = make_run(tmp_path / "run", n=20)
+    (tmp_path / "elsewhere").mkdir()
+    path = tmp_path / "run" / "data.zarr"
+    path.write_text("no store") if kind == "file" else path.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match=r"a folder is needed|which a run never has"):
+        seal(run.storage)
+    assert list((tmp_path / "elsewhere").iterdir()) == [] and store_record(run.storage) is None
+
+
+# When a store is written ----------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("few_arrays")
+def test_an_up_to_date_store_is_not_written_and_a_grown_run_switches_to_another(tmp_path: Path) -> None:
     run = make_run(tmp_path, n=13)
     seal(run.storage)
-    grown = make_run(tmp_path, n=37)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    assert seal(run.storage) == f"{tmp_path}/data.zarr"
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+    for number, n in ((2, 14), (3, 37)):  # within the last shard, and by new ones
+        make_run(tmp_path, n=n)
+        assert seal(run.storage) == f"{tmp_path}/data-{number}.zarr"
+        assert_rows(stored(run.storage), expected(of(run, 0, 1, 2, 3)[: len(run.planned())], -(-n // 5), n))
+        assert [path.name for path in tmp_path.glob("*.zarr")] == [f"data-{number}.zarr"]
+    assert found(tmp_path) == []
+    run.storage.delete(["data.json"])
+    assert found(tmp_path) == [("sealed", "data.json")]
+    assert seal(run.storage) == f"{tmp_path}/data-4.zarr"  # another process may still remove those before
+
+
+@pytest.mark.usefixtures("few_arrays")
+def test_two_stores_of_one_specification_have_equal_bytes(tmp_path: Path) -> None:
+    for who, shards in (("a", [0, 1, 2]), ("b", [2, 0, 1])):
+        seal(fill(tmp_path, who, shards, n=23).storage)
+    for name in ("data.zarr", "data.json"):
+        one, other = tmp_path / "a" / name, tmp_path / "b" / name
+        assert (files_of(one) or one.read_bytes()) == (files_of(other) or other.read_bytes())
+
+
+def test_a_disk_that_fills_up_keeps_what_is_committed_and_continues_with_room(tiny_disk: Path) -> None:
+    run = make_run(tiny_disk, n=1, shards=[])
+    run.grow(600)
+    with pytest.raises(InputError, match=r"No space left on device\. Free disk space") as e:
+        for shard in run.missing():
+            assert run.commit(write(run, shard, f"a-{shard}"))
+    assert "\n" not in str(e.value)
+    done = sorted(run.committed())
+    assert done and all(run.read_object(commit) for commit in Run.open(tiny_disk).commits())
+    with pytest.raises(InputError, match="No space left on device"):
+        seal(run.storage)
+    assert list(tiny_disk.glob("data*")) == []
+    subprocess.run(["mount", "-o", "remount,size=64m", str(tiny_disk)], check=True)
+    assert run.commit(write(run, len(done), "b"))
+    assert seal(run.storage) == f"{tiny_disk}/data.zarr"
+    assert_rows(stored(run.storage), expected(of(run, *done, len(done))))
+
+
+class Killed(BaseException):
+    """The end of a process: none of its later changes is made either."""
+
+
+class Changes:
+    """Counts the changes that a thread makes to storages; `before` is called before each."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, before: Callable[[int], None]) -> None:
+        self.made = 0
+        for name in ("put", "put_new", "delete", "sync", "remove_empty"):
+            plain = getattr(Storage, name)
+
+            def change(storage: Storage, *arguments: Any, plain: Callable[..., Any] = plain) -> Any:
+                self.made += 1
+                before(self.made)
+                return plain(storage, *arguments)
+
+            patch.setattr(Storage, name, change)
+
+
+def dies_at(number: int) -> Callable[[int], None]:
+    def die(made: int) -> None:
+        if made >= number:
+            raise Killed
+
+    return die
+
+
+@pytest.mark.usefixtures("few_arrays")
+@pytest.mark.parametrize("place", ["disk", "s3"])
+def test_a_seal_that_is_killed_leaves_the_old_store_or_the_new_one(
+    place: str, tmp_path: Path, bucket: str
+) -> None:
+    storage = open_storage(tmp_path / "run" if place == "disk" else f"{bucket}/some/run")
+    layout = Layout(scenes_per_shard=2, candidates_per_scene=5)
+    run = Run.create_or_open(storage, manifest_of(small_spec(), layout), 10)
+    assert attempt(run, 0, "a-0")
+    seen, shards, at = set[str](), 1, 1
+    while shards < 40:
+        old = store_record(storage)
+        with pytest.MonkeyPatch.context() as patch:
+            changes = Changes(patch, dies_at(at))
+            try:
+                seal(storage)
+            except Killed:
+                pass
+        record = store_record(storage)
+        seen.add("none" if record is None else "old" if record == old else "new")
+        if record is not None:
+            held = record.parts[0].n // 10
+            assert_rows(stored(storage), expected(of(run, *range(held))))
+        assert [kind for kind, _ in found(storage.url) if kind not in ("stale", "sealed")] == []
+        if changes.made < at:
+            break
+        seal(storage)
+        assert_rows(stored(storage), expected(of(run, *range(shards))))
+        assert found(storage.url) == []
+        run.grow(run.n + 10)
+        assert attempt(run, shards, f"a-{shards}")
+        shards, at = shards + 1, at + (1 if place == "disk" and at < 4 else 9)
+    assert seen == {"none", "old", "new"}
+
+
+class Turns:
+    """Lets one of several threads at a time make its next change, in a given order."""
+
+    def __init__(self, order: list[int], count: int) -> None:
+        self._order, self._waiting, self._running = list(order), dict[int, threading.Event](), count
+        self._lock = threading.Lock()
+
+    def wait(self, who: int) -> None:
+        with self._lock:
+            event = self._waiting[who] = threading.Event()
+            self._next()
+        event.wait()
+
+    def end(self) -> None:
+        with self._lock:
+            self._running -= 1
+            self._next()
+
+    def _next(self) -> None:
+        if self._running and len(self._waiting) == self._running:
+            number = self._order.pop() if self._order else 0
+            self._waiting.pop(sorted(self._waiting)[number % len(self._waiting)]).set()
+
+
+@pytest.mark.usefixtures("few_arrays")
+@settings(max_examples=12)
+@given(order=st.lists(st.integers(0, 5), min_size=200, max_size=200))
+def test_seals_at_the_same_time_leave_a_whole_store_in_any_order(
+    order: list[int], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Processes that seal the run again and again while it grows, each change in turn."""
+    run = make_run(tmp_path_factory.mktemp("run"), 10)
+    turns, names, errors = Turns(order, 3), dict[int, int](), list[BaseException]()
+
+    def act(me: int) -> None:
+        names[threading.get_ident()] = me
+        try:
+            for k in range(3):
+                run.grow(10 + 10 * k + 5 * me)
+                for shard in run.missing():
+                    attempt(run, shard, f"{me}-{k}-{shard}")
+                seal(Run.open(folder_of(run)).storage)
+                if (record := store_record(run.storage)) is not None and me == 0:
+                    assert (
+                        run.storage.exists(f"{record.name}/zarr.json") or store_record(run.storage) != record
+                    )
+        except BaseException as e:  # noqa: BLE001
+            errors.append(e)
+        finally:
+            turns.end()
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("datagen.schemas.sealing._exchange", lambda one, other: False)
-        seal(grown.storage)
-        assert_equal(zarr.open_group(tmp_path / SEALED, mode="r"), expected(grown, [0, 1, 2, 3], 8, 37))
-        before = files_of(tmp_path)
-        refuse_renames_onto(tmp_path / SEALED, patch)
-        with pytest.raises(InputError, match="Input/output error"):
-            seal(grown.storage)
-    assert files_of(tmp_path) == before  # the old store got its name back
+        Changes(patch, lambda made: turns.wait(names[threading.get_ident()]))
+        threads = [threading.Thread(target=act, args=(k,)) for k in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert errors == []
+    stored(run.storage)  # whole
+    assert [kind for kind, _ in found(folder_of(run)) if kind not in ("stale", "account")] == []
+    seal(run.storage)
+    assert_rows(stored(run.storage), expected(of(run, *run.planned())))
 
 
-def refuse_renames_onto(target: Path, patch: pytest.MonkeyPatch) -> None:
-    """Let the renaming of a finished store onto a free name fail."""
-    plain, refused = Path.rename, list[Path]()
-
-    def rename(path: Path, onto: Path) -> Path:
-        if onto == target and not target.exists() and not refused:
-            refused.append(path)
-            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
-        return plain(path, onto)
-
-    patch.setattr(Path, "rename", rename)
-
-
-@pytest.mark.parametrize("kind", ["file", "link", "empty folder"])
-def test_whatever_has_the_name_makes_way(tmp_path: Path, kind: str):
-    run = make_run(tmp_path / "run", n=20)
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    (elsewhere / "kept").write_text("")
-    sealed = tmp_path / "run" / SEALED
-    if kind == "file":
-        sealed.write_text("no store")
-    elif kind == "link":
-        sealed.symlink_to(elsewhere)
-    else:
-        sealed.mkdir()
-    assert_equal(zarr.open_group(seal(run.storage), mode="r"), expected(run, [0, 1], 4, 20))
-    assert [p.name for p in sealed.parent.iterdir() if p.name.startswith(SEALED)] == [SEALED]
-    assert (elsewhere / "kept").exists()
-
-
-def test_the_store_says_its_conventions_source_licences_and_coordinates(tmp_path: Path):
-    spec = small_spec().model_copy(
-        update={
-            "houses": Source(kind="procthor", digest="1" * 64),
-            "objects": Source(kind="ycb", digest="2" * 64),
-        }
-    )
-    run = make_run(tmp_path / "a", n=13, spec=spec)
-    told = xarray.open_zarr(seal(run.storage), chunks=None).attrs
-    assert told["title"].endswith("in houses read as procthor with objects read as ycb")
-    assert told["license"] == "houses read as procthor: not stated; objects read as ycb: not stated"
-    assert told["references"] == ""
-    stated = {"title": "My houses", "licence": "CC0-1.0", "attribution": "me"}
-    sources = {f"houses_{key}": text for key, text in stated.items()} | {"objects_licence": "MIT"}
-    run = make_run(tmp_path / "b", n=13, spec=spec, sources=sources)
-    data = xarray.open_zarr(seal(run.storage), chunks=None)
-    told = data.attrs
-    assert told["Conventions"] == "CF-1.11, ACDD-1.3"
-    assert told["title"] == "Robot base poses labelled by heuristic, in My houses with objects read as ycb"
-    assert told["license"] == "My houses: CC0-1.0; objects read as ycb: MIT"
-    assert told["references"] == "me" and told["acknowledgement"].startswith("My houses: me; ")
-    assert f"objects ycb sha256 {'2' * 64}" in told["source"]
-    assert (
-        told["history"].startswith("datagen submit heuristic --n 13, seed 0")
-        and spec.hash() in told["history"]
-    )
-    assert "datagen.candidates" in told["comment"]
-    coordinates = {"scene_index", "house_id", "sample_scene_index", "candidate_index", "robot_index"}
-    assert set(data.coords) == coordinates
-    assert data["label"].encoding["coordinates"] == "sample_scene_index candidate_index robot_index"
-
-
-def test_two_stores_of_one_specification_have_equal_metadata(tmp_path: Path):
-    roots = [Path(seal(make_run(tmp_path / name, n=13).storage)) / "zarr.json" for name in "ab"]
-    assert roots[0].read_bytes() == roots[1].read_bytes()
+@pytest.mark.usefixtures("few_arrays")
+def test_a_truncated_store_is_damage_for_its_readers_on_disk_and_on_s3(tmp_path: Path, bucket: str) -> None:
+    for place in (str(tmp_path / "run"), f"{bucket}/run"):
+        storage = make_run(place, 40).storage
+        seal(storage)
+        key = "data.zarr/points_m/c.0.0.0"
+        whole = storage.get(key, 2**20)
+        assert whole is not None
+        for data in (whole[:-1], whole[:3], whole[len(whole) // 2 :], b"\0" * len(whole)):
+            storage.put(key, data)
+            (part,) = open_parts([f"{place}/data.zarr"], ["points_m", "label"])
+            with pytest.raises(
+                InputError, match=r"points_m/c\.0\.0\.0: points_m: (its index|the crc32c)"
+            ) as e:
+                part.shards[0].read(part.arrays.values())
+            assert type(e.value) is InputError  # not an unavailable store
+            assert ("sealed", key) in found(place)
+    assert len(check(tmp_path / "run")[0]) == 1 and tree(storage)

@@ -63,6 +63,7 @@ def seal(storage: Storage, tick: Tick = lambda done, total: None) -> str:
     except BaseException:
         with suppress(InputError):
             remove_store(storage, name)
+            storage.delete([f"{name}{CLAIM}"])  # no record named it, so no other process removes it
         raise
     new = StoreRecord(name=name, rows_sha256=digest, parts=parts, files=files)
     storage.put(RECORD, encode_record(new))
