@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import zarr
 from obstore.store import from_url
 from zarr.storage import ObjectStore
@@ -156,3 +157,34 @@ def check(place: Path | str) -> tuple[list[Finding], Checked]:
 def found(place: Path | str) -> list[tuple[str, str]]:
     """(kind, file) of every finding."""
     return [(f.kind, f.key) for f in check(place)[0]]
+
+
+# Changes -------------------------------------------------------------------------------------
+
+
+class Killed(BaseException):
+    """The end of a process: none of its later changes is made either."""
+
+
+class Changes:
+    """Counts the changes that a thread makes to storages; `before` is called before each."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, before: Callable[[int], None]) -> None:
+        self.made = 0
+        for name in ("put", "put_new", "delete", "sync", "remove_empty"):
+            plain = getattr(Storage, name)
+
+            def change(storage: Storage, *arguments: Any, plain: Callable[..., Any] = plain) -> Any:
+                self.made += 1
+                before(self.made)
+                return plain(storage, *arguments)
+
+            patch.setattr(Storage, name, change)
+
+
+def dies_at(number: int) -> Callable[[int], None]:
+    def die(made: int) -> None:
+        if made >= number:
+            raise Killed
+
+    return die

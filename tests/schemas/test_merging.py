@@ -1,80 +1,212 @@
-"""What a merge writes, refuses, adds to and leaves alone, case by case; its laws are in properties."""
+"""Merges: each scene once, whatever the sizes of shards; conflicts refused; interrupted merges completed."""
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import SCHEMAS
-from datagen.schemas.lineage import LINEAGE, Lineage, lineage_summary
-from datagen.schemas.merging import MergeResult, merge_runs, plan_merge
-from datagen.schemas.merging.writing import GUESS_CAUSE, SPARE_CAUSE
-from datagen.schemas.record_files import MERGED, part_folder, read_record
+from datagen.schemas.merging import SPARE_CAUSE, merge_runs, plan_merge
+from datagen.schemas.merging.conflicts import refuse_different_rows
+from datagen.schemas.record_files import MERGED, signed_json
 from datagen.schemas.run import Run, find_scene, label_counts, open_runs
-from datagen.schemas.run_records import LedgerEntry, QuarantineRecord
-from datagen.schemas.sealing import seal, sealed_root
-from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.run_records import FORMAT_VERSION, Layout, LedgerEntry, QuarantineRecord
+from datagen.schemas.sealing import seal, store_record
 from datagen.schemas.specification import Source
-from datagen.schemas.storage import open_storage
-from tests.faults.crash_points_operations import small_schema
-from tests.made_runs import attempt, commit_of, files_of, make_run, manifest_of, rows_of, small_spec
+from datagen.schemas.storage import Storage, open_storage
+from datagen.train.run_parts import open_parts
+from tests.made_runs import Tables, attempt, files_of, make_run, manifest_of, rows_of, small_spec, tables_of
+from tests.schemas.checked import (
+    Arrays,
+    Changes,
+    Killed,
+    assert_rows,
+    commit_object,
+    dies_at,
+    encoded,
+    fill,
+    folder_of,
+    found,
+    merge,
+    resume,
+    stored,
+    tree,
+)
+
+pytestmark = pytest.mark.usefixtures("few_arrays")
 
 
-@pytest.fixture(autouse=True)
-def few_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A merge of fifty arrays a shard takes the paths of one of few."""
-    monkeypatch.setitem(SCHEMAS, "heuristic", small_schema())
+# One specification ----------------------------------------------------------------------------
 
 
-def merge(folder: Path | str, names: Sequence[str], out: str = "out") -> MergeResult:
-    return merge_runs(plan_merge([f"{folder}/{name}" for name in names], f"{folder}/{out}"))
-
-
-def fill(folder: Path, shards: Sequence[int], who: str, n: int = 60, size: int = 2, seed: int = 0) -> Run:
-    """A run whose attempts have names of their own."""
-    run = make_run(folder / who, n, size, shards=[], spec=small_spec(seed))
-    for shard in shards:
-        assert attempt(run, shard, f"{shard:06d}-{who}")
-    return run
-
-
-def test_partial_runs_of_one_specification_become_an_ordinary_run(tmp_path: Path):
-    fill(tmp_path, [0, 2], "a", n=40)
-    fill(tmp_path, [1, 2, 5], "b", n=60)
-    result = merge(tmp_path, "ab")
+def test_partial_runs_become_an_ordinary_run_and_the_cost_of_duplicates_is_kept(tmp_path: Path) -> None:
+    fill(tmp_path, "a", [0, 2], n=40)
+    fill(tmp_path, "b", [1, 2, 5], n=60)
+    (written,) = merge(tmp_path, "ab").written
+    assert (written.copied, written.there, written.spare) == (4, 0, 1)
     run = Run.open(tmp_path / "out")
-    assert run.committed() == {0, 1, 2, 5}
-    assert run.n == 60
-    assert list(run.missing()) == [3, 4]
-    assert run.commit_of(2).attempt == "000002-a"  # the smaller name
-    ends = {end.attempt: (end.outcome, end.cause) for end in run.ledger.ends()}
-    assert ends["000002-b"] == ("superseded", SPARE_CAUSE)
-    assert ends["000005-b"] == ("committed", "")
-    assert len(ends) == 5
-    assert not (tmp_path / "out" / MERGED).exists()
-    root = sealed_root(run.storage)
-    assert root is not None
-    assert root.parts[0].missing_shards == [3, 4]
-    (written,) = result.written
-    assert (written.linked, written.cut, written.there, written.spare) == (4, 0, 0, 1)
+    assert (run.committed(), run.n, list(run.missing())) == ({0, 1, 2, 5}, 60, [3, 4])
+    kept = run.commit_of(2)
+    assert kept.attempt == "000002-a-2"  # the smaller name
+    (end,) = run.ledger.ends()
+    assert (end.attempt, end.outcome, end.cause) == ("000002-b-2", "superseded", SPARE_CAUSE)
+    assert end.cost == kept.cost and end.started == run.ledger.start_of(end.attempt).started  # type: ignore[union-attr]
+    assert run.ledger.attempts() == {
+        f"{name}-2" for name in ("000000-a", "000001-b", "000002-a", "000002-b", "000005-b")
+    }
+    record = store_record(run.storage)
+    assert record is not None and record.parts[0].missing == ((3, 5),)
+    assert found(tmp_path / "out") == [] and not (tmp_path / "out" / MERGED).exists()
+    before = tree(run.storage)
+    assert merge(tmp_path, "ab").written[0].copied == 0 and tree(run.storage) == before
 
 
-def test_runs_of_several_specifications_become_a_place_of_parts(tmp_path: Path):
-    fill(tmp_path, [0, 1], "a", n=20)
-    fill(tmp_path, [0, 2], "b", n=30, seed=1)
+def of_scenes(run: Run, scenes: Iterable[int]) -> Arrays:
+    """The rows that the specification has for these scenes."""
+    layout = Layout(scenes_per_shard=1, candidates_per_scene=5)
+    spec = run.manifest.spec
+    each = [tables_of(run.schema, layout, spec.seed, scene, run.manifest.spec_hash) for scene in scenes]
+    return {name: np.concatenate([tables[t][name] for tables in each]) for t in (0, 1) for name in each[0][t]}
+
+
+def by_scene(arrays: Arrays) -> Arrays:
+    orders = (
+        np.argsort(arrays["scene_index"], kind="stable"),
+        np.argsort(arrays["sample_scene_index"], kind="stable"),
+    )
+    samples = len(arrays["sample_scene_index"])
+    is_sample = {name: name.startswith(("sample", "candidate", "label", "distance")) for name in arrays}
+    assert all(
+        len(values) == (samples if is_sample[name] else len(orders[0])) for name, values in arrays.items()
+    )
+    return {name: values[orders[is_sample[name]]] for name, values in arrays.items()}
+
+
+def assert_scenes(storage: Storage, scenes: Iterable[int]) -> None:
+    """The store, and the runs as training reads them, have these scenes, each once, with their rows."""
+    runs = open_runs(storage)
+    wanted = of_scenes(runs[0], sorted(scenes))
+    assert_rows(by_scene(stored(storage)), wanted)
+    counts = label_counts(runs)
+    assert (counts.labels, counts.n) == (len(wanted["label"]), runs[0].n)
+    parts = open_parts([storage.url], list(wanted), allow_incomplete=True)
+    read = [place.read(part.arrays.values()) for part in parts for place in part.shards]
+    assert_rows(by_scene({name: np.concatenate([each[name] for each in read]) for name in wanted}), wanted)
+    assert found(storage.url) == []
+
+
+# Sources, each as its scenes per shard, its shards, and its number of scenes.
+SOURCES = st.lists(
+    st.tuples(st.integers(1, 6), st.sets(st.integers(0, 11), min_size=1), st.integers(1, 24)),
+    min_size=1,
+    max_size=4,
+)
+
+
+@settings(max_examples=15)
+@given(sources=SOURCES, more=st.integers(1, 9))
+@example(sources=[(6, {0}, 12), (2, {4}, 12)], more=1)  # a scene in the middle of a shard that is missing
+@example(sources=[(6, {0}, 24), (5, {1}, 24), (4, {1, 2, 4}, 24)], more=5)
+@example(sources=[(2, {0, 1}, 10), (2, {1, 3}, 12), (3, {1}, 9)], more=4)
+def test_each_scene_counts_once_whatever_the_sizes_of_shards_and_the_order_of_sources(
+    sources: list[tuple[int, set[int], int]], more: int, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder, held = tmp_path_factory.mktemp("runs"), set[int]()
+    for k, (size, shards, scenes) in enumerate(sources):
+        run = fill(
+            folder, f"r{k}", [shard for shard in sorted(shards) if shard * size < 24], 5 * scenes, size
+        )
+        held |= {scene for shard in run.committed() for scene in range(shard * size, (shard + 1) * size)}
+    names, end = [f"r{k}" for k in range(len(sources))], max(scenes for _, _, scenes in sources)
+    merge(folder, names)
+    storage = open_storage(folder / "out")
+    if held & set(range(end)):
+        assert_scenes(storage, held & set(range(end)))
+    merge(folder, names[::-1], "other")
+    assert whole(folder / "other") == whole(folder / "out")
+    resume(storage)  # parts lack shards
+    assert_scenes(storage, range(end))
+    for run in open_runs(storage):
+        run.grow(5 * (end + more))
+    resume(storage)
+    assert_scenes(storage, range(end + more))
+
+
+def whole(place: Path | str) -> dict[str, bytes | None]:
+    """Every file of a place but for claims, which are random."""
+    return {key: data for key, data in tree(open_storage(place)).items() if not key.endswith(".claim")}
+
+
+def test_a_merge_into_existing_runs_adds_and_keeps_what_is_committed(tmp_path: Path) -> None:
+    fill(tmp_path, "b", [0, 1], n=20)
+    fill(tmp_path, "a", [1, 2], n=30)
+    merge(tmp_path, "b")
+    before = files_of(tmp_path / "out" / "commits")
+    (written,) = merge(tmp_path, "a").written
+    run = Run.open(tmp_path / "out")
+    assert files_of(tmp_path / "out" / "commits").items() >= before.items()
+    assert (written.there, written.copied, written.spare, run.n) == (2, 1, 1, 30)
+    assert run.commit_of(1).attempt == "000001-b-2"  # though another name is smaller
+    assert [end.attempt for end in run.ledger.ends()] == ["000001-a-2"]
+    # Further specifications and sizes of shards, added one after the other.
+    for who, size, seed in (("c", 2, 1), ("d", 3, 1), ("e", 2, 2)):
+        fill(tmp_path, who, [0, 1], n=30, size=size, seed=seed)
+    merge(tmp_path, "cd", "parts")
+    merge(tmp_path, "ae", "parts")
+    merge(tmp_path, "acde", "at_once")
+    one, other = (tree(open_storage(tmp_path / name)) for name in ("parts", "at_once"))
+    assert {k: v for k, v in one.items() if "data" not in k} == {
+        k: v for k, v in other.items() if "data" not in k
+    }
+    assert_rows(stored(open_storage(tmp_path / "parts")), stored(open_storage(tmp_path / "at_once")))
+    assert found(tmp_path / "parts") == []
+
+
+def test_a_repaired_attempt_that_another_source_kept_has_one_account(tmp_path: Path) -> None:
+    fill(tmp_path, "a", [0])
+    run = fill(tmp_path, "b", [1])
+    run.ledger.start("000000-a-2", 0)
+    run.ledger.end(LedgerEntry(attempt="000000-a-2", shard=0, outcome="superseded", cause="set aside"))
+    merge(tmp_path, "ab")
+    assert found(tmp_path / "out") == []
+
+
+def test_quarantine_is_kept_for_shards_that_no_source_has(tmp_path: Path) -> None:
+    run = fill(tmp_path, "a", [0])
+    fill(tmp_path, "b", [2])
+    for shard in (1, 2):
+        run.quarantine(QuarantineRecord(
+            shard=shard, seed=0, first_scene=2 * shard, scenes=2, attempts=("x",), causes=("",), stacks=("",),
+            created="",
+        ))  # fmt: skip
+    merge(tmp_path, "ab")
+    assert Run.open(tmp_path / "out").quarantined() == {1}
+
+
+# Several specifications -----------------------------------------------------------------------
+
+
+def test_runs_of_several_specifications_become_parts(tmp_path: Path) -> None:
+    fill(tmp_path, "a", [0, 1], n=20)
+    fill(tmp_path, "b", [0, 2], n=30, seed=1)
+    houses = {"houses": Source(kind="procthor", digest="3" * 64)}
+    for who, spec in (("c", small_spec(split="val")), ("d", small_spec().model_copy(update=houses))):
+        make_run(tmp_path / who, 10, shards=[0], spec=spec)
+    merge(tmp_path, "abcd", "all")
+    assert len(open_runs(tmp_path / "all")) == 4
     merge(tmp_path, "ab")
     runs = open_runs(tmp_path / "out")
     assert [run.manifest.spec_hash for run in runs] == sorted(small_spec(k).hash() for k in (0, 1))
-    assert not (tmp_path / "out" / "manifest.json").exists()
-    found = label_counts(runs)
-    assert (found.n, found.labels, found.missing) == (50, 40, 1)
-    first = runs[0]
-    assert find_scene(runs, 1) == (first, 1)
-    assert find_scene(runs, -(-first.n // 5)) == (runs[1], 0)
+    counts = label_counts(runs)
+    assert (counts.n, counts.labels, counts.missing) == (50, 40, 1)
+    assert find_scene(runs, 1) == (runs[0], 1) and find_scene(runs, -(-runs[0].n // 5)) == (runs[1], 0)
     for scene in (-1, 10):
         with pytest.raises(InputError, match=rf"--scene: {scene} is in none .* Give one from 0 to 9"):
             find_scene(runs, scene)
@@ -82,188 +214,78 @@ def test_runs_of_several_specifications_become_a_place_of_parts(tmp_path: Path):
         Run.open(tmp_path / "out")
 
 
-def test_lineage_names_the_runs_that_made_the_shards_through_merged_ones(tmp_path: Path):
-    fill(tmp_path, [0, 1, 3], "a")
-    fill(tmp_path, [1, 2], "b")
-    fill(tmp_path, [2, 3], "c", size=1)
-    merge(tmp_path, "ab", "ab")
-    assert attempt(Run.open(tmp_path / "ab"), 4, "made-there")
-    merge(tmp_path, ["ab", "c"])
-    out = Run.open(tmp_path / "out")
-    told = {source["address"]: source["ranges"] for source in lineage_summary(out)}
-    assert told == {
-        str(tmp_path / "a"): [[0, 3], [6, 7]],
-        str(tmp_path / "ab"): [[8, 9]],
-        str(tmp_path / "b"): [[4, 5]],
-        str(tmp_path / "c"): [],  # its scenes were kept from a and b
-    }
-    assert lineage_summary(Run.open(tmp_path / "a")) == []
-    record = read_record(out.storage, LINEAGE, Lineage)
-    assert record is not None
-    assert record.sources[0].platform == "test"
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [("parts/a", [[5, 2]]), ("parts/b", [])],
+        [("parts/a", [[0, 4], [2, 6]]), ("parts/b", [])],
+        [("parts/a", [[0, 10**19]]), ("parts/b", [])],
+        [("../a", []), ("parts/b", [])],
+        [("parts/a", [])],
+    ],
+)
+def test_hostile_records_of_merged_runs_are_refused(
+    parts: list[tuple[str, list[list[int]]]], tmp_path: Path
+) -> None:
+    storage = open_storage(tmp_path)
+    fields = [{"folder": folder, "spec_hash": "0" * 64, "scenes": scenes} for folder, scenes in parts]
+    storage.put(MERGED, signed_json({"format_version": FORMAT_VERSION, "parts": fields}))
+    with pytest.raises(InputError, match=r"merged\.json: parts"):
+        open_runs(storage)
 
 
-def test_a_merge_in_place_adds_and_keeps_what_is_committed(tmp_path: Path):
-    fill(tmp_path, [0, 1], "b", n=20)
-    fill(tmp_path, [1, 2], "a", n=30)
-    merge(tmp_path, "b")
-    before = files_of(tmp_path / "out" / "commits")
-    (written,) = merge(tmp_path, "a").written
-    run = Run.open(tmp_path / "out")
-    assert files_of(tmp_path / "out" / "commits").items() >= before.items()
-    assert (written.there, written.linked, written.spare) == (2, 1, 1)
-    assert run.commit_of(1).attempt == "000001-b"  # though another name is smaller
-    assert run.n == 30
-    assert {e.attempt: e.outcome for e in run.ledger.ends()}["000001-a"] == "superseded"
-    told = {source["address"]: source["ranges"] for source in lineage_summary(run)}
-    assert told == {str(tmp_path / "a"): [[2, 2]], str(tmp_path / "b"): [[0, 1]]}
-    assert list(merge(tmp_path, ["out"]).written) == []  # nothing to add to itself
+# Interruptions and places ---------------------------------------------------------------------
 
 
-def test_a_place_of_parts_takes_further_specifications(tmp_path: Path):
-    for k, who in enumerate("abc"):
-        fill(tmp_path, [0], who, seed=k)
-    merge(tmp_path, "ab")
-    merge(tmp_path, "c")
-    merge(tmp_path, "abc", "at_once")
-    assert files_of(tmp_path / "out") == files_of(tmp_path / "at_once")
+def test_an_interrupted_merge_is_completed_by_the_same_command(tmp_path: Path) -> None:
+    for who, seed, size in (("a", 0, 2), ("b", 0, 2), ("c", 1, 2), ("d", 1, 3)):
+        fill(tmp_path, who, [0, 1, 2], seed=seed, size=size)
+    merge(tmp_path, "abcd", "undisturbed")
+    made, at = 10**6, 1
+    while made >= at:
+        out = f"0{at}"  # first by name, where it would be taken for the shards' origin
+        with pytest.MonkeyPatch.context() as patch:
+            changes = Changes(patch, dies_at(at))
+            with suppress(Killed):
+                merge(tmp_path, "abcd", out)
+        made, at = changes.made, at + 5
+        merge(tmp_path, "abcd", out)
+        assert {k: v for k, v in whole(tmp_path / out).items() if "data" not in k} == {
+            k: v for k, v in whole(tmp_path / "undisturbed").items() if "data" not in k
+        }, at
+        assert_rows(stored(open_storage(tmp_path / out)), stored(open_storage(tmp_path / "undisturbed")))
 
 
-def test_a_merge_that_was_cut_short_is_finished_by_the_same_command(tmp_path: Path):
-    for seed, who in ((0, "a"), (0, "b"), (1, "c")):
-        fill(tmp_path, [0, 1, 2], who, seed=seed)
-    merge(tmp_path, "abc", "whole")
-    wanted_files = files_of(tmp_path / "whole")
-
-    class Killed(Exception): ...
-
-    for after in range(0, 12, 2):
-        out = f"0{after}"  # first by name, where it would be taken for the shards' origin
-        left = after
-
-        def step() -> None:
-            nonlocal left
-            left -= 1
-            if left < 0:
-                raise Killed
-
-        with pytest.raises(Killed):
-            merge_runs(plan_merge([f"{tmp_path}/{name}" for name in "abc"], f"{tmp_path}/{out}"), step)
-        merge(tmp_path, "abc", out)
-        assert files_of(tmp_path / out) == wanted_files, after
+def test_merges_on_s3_give_the_same_files(tmp_path: Path, bucket: str) -> None:
+    layout = Layout(scenes_per_shard=2, candidates_per_scene=5)
+    for who, seed, shards in (("a", 0, [0, 1]), ("b", 0, [1, 2]), ("c", 1, [0])):
+        run = Run.create_or_open(open_storage(f"{bucket}/{who}"), manifest_of(small_spec(seed), layout), 40)
+        for shard in shards:
+            assert attempt(run, shard, f"{shard:06d}-{who}")
+    for _ in range(2):
+        merge(bucket, "abc")
+    merge(bucket, "ab", "ab")
+    merge_runs(plan_merge([f"{bucket}/{name}" for name in ("ab", "c")], str(tmp_path / "here")))
+    assert whole(f"{bucket}/out") == whole(tmp_path / "here")
 
 
-def test_a_merge_that_was_killed_while_it_named_its_parts_is_finished_by_the_same_command(tmp_path: Path):
-    fill(tmp_path, [0, 1], "a")
-    fill(tmp_path, [0, 1], "b", seed=1)
-    merge(tmp_path, "ab", "done")
-    planned = plan_merge([f"{tmp_path}/a", f"{tmp_path}/b"], f"{tmp_path}/out")
-    merge_runs(planned)
-    # Its copy was there, and its draft half written.
-    named = (tmp_path / "out" / MERGED).read_bytes()
-    (tmp_path / "out" / MERGED).unlink()
-    (tmp_path / "out" / f"{MERGED}.0123456789abcdef.part").write_bytes(named[:20])
-    shutil.rmtree(tmp_path / "out" / "data.zarr")
-    merge(tmp_path, "ab")
-    assert sealed_root(open_storage(tmp_path / "out")) == sealed_root(open_storage(tmp_path / "done"))
-
-
-def test_what_was_known_of_an_attempt_grows_with_its_source(tmp_path: Path):
-    run = fill(tmp_path, [0], "a")
-    fill(tmp_path, [1], "b")
-    run.ledger.start("late", 1)
-    merge(tmp_path, "ab")
-    out = Run.open(tmp_path / "out")
-    late = out.ledger.end_of("late")
-    assert late is not None
-    assert (late.outcome, late.cause, late.cost) == ("lost", GUESS_CAUSE, None)
-    cost = run.commit_of(0).cost
-    run.ledger.end(LedgerEntry(attempt="late", shard=1, outcome="superseded", cost=cost))
-    merge(tmp_path, "ab")
-    late = out.ledger.end_of("late")
-    assert late is not None
-    assert (late.outcome, late.cost) == ("superseded", cost)
-
-
-def test_an_end_that_no_ledger_has_is_taken_from_the_commit(tmp_path: Path):
-    run = fill(tmp_path, [0], "a")
-    (tmp_path / "a" / "ledger" / "000000-a.json").unlink()
-    fill(tmp_path, [1], "b")
-    merge(tmp_path, "ab")
-    end = Run.open(tmp_path / "out").ledger.end_of("000000-a")
-    assert end is not None
-    assert (end.outcome, end.cost, end.ended) == (
-        "committed",
-        run.commit_of(0).cost,
-        run.commit_of(0).created,
-    )
-
-
-def test_quarantine_comes_along_for_shards_that_nobody_has(tmp_path: Path):
-    run = fill(tmp_path, [0], "a")
-    fill(tmp_path, [2, 3], "b", size=1)
-    for shard in (1, 2):
-        record = QuarantineRecord(
-            shard=shard, seed=0, first_scene=2 * shard, scenes=2, attempts=("x",), causes=("",), stacks=("",),
-            created="",
-        )  # fmt: skip
-        run.quarantine(record)
-    merge(tmp_path, "ab")
-    out = Run.open(tmp_path / "out")
-    assert out.quarantined() == {4, 5}
-    assert [(r.first_scene, r.scenes) for r in out.quarantine_records()] == [(4, 1), (5, 1)]
-
-
-def test_equal_rows_in_other_bytes_are_no_conflict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    fill(tmp_path, [0], "a")
-    run = fill(tmp_path, [], "b")
-    monkeypatch.setattr(
-        "datagen.schemas.shard_files.ZSTD_LEVEL", 19
-    )  # as another version of the compressor might
-    scenes, samples = rows_of(run, 0)
-    files = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
-    assert run.commit(commit_of(run, 0, "z", run.write_shard(0, "z", files), int(samples["label"].sum())))
-    ours = {e.path: e.sha256 for e in Run.open(tmp_path / "a").commit_of(0).files}
-    assert {e.path: e.sha256 for e in run.commit_of(0).files} != ours
-    merge(tmp_path, "ab")
-    assert Run.open(tmp_path / "out").commit_of(0).attempt == "000000-a"
-
-
-def test_runs_of_another_kind_are_refused_naming_every_difference(tmp_path: Path):
-    make_run(tmp_path / "a", 20, shards=[0], spec=small_spec(engines={"label": "1"}))
-    make_run(tmp_path / "b", 20, shards=[0], spec=small_spec(n_points=65, engines={"label": "2"}))
-    with pytest.raises(InputError) as refused:
-        merge(tmp_path, "ab")
-    told = str(refused.value)
-    for word in (f"{tmp_path}/a", f"{tmp_path}/b", "engines.label: '1' and '2'", "n_points: 64 and 65"):
-        assert word in told
-    make_run(tmp_path / "c", 20, candidates_per_scene=4, shards=[0])
-    make_run(tmp_path / "d", 20, shards=[0])
-    with pytest.raises(InputError, match="candidates_per_scene: 4 and 5"):
-        merge(tmp_path, "cd")
-    assert not (tmp_path / "out").exists()
-
-
-def test_other_seeds_splits_and_sources_are_other_samples_of_one_kind(tmp_path: Path):
-    houses = Source(kind="procthor", digest="3" * 64)
-    specs = [small_spec(), small_spec(1), small_spec(split="val")]
-    specs.append(small_spec().model_copy(update={"houses": houses}))
-    for k, spec in enumerate(specs):
-        make_run(tmp_path / str(k), 10, shards=[0], spec=spec)
-    merge(tmp_path, "0123")
-    assert len(open_runs(tmp_path / "out")) == 4
-
-
-def test_what_cannot_be_added_to_a_place_is_refused_before_anything_is_written(tmp_path: Path):
-    fill(tmp_path, [0], "a")
-    fill(tmp_path, [1], "b", seed=1)
-    fill(tmp_path, [1], "c", size=3)
-    make_run(tmp_path / "d", 20, shards=[0], spec=small_spec(n_points=65))
+def test_runs_that_cannot_be_merged_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    fill(tmp_path, "a", [0])
+    fill(tmp_path, "b", [1], seed=1)
+    fill(tmp_path, "c", [1], size=3)
+    make_run(tmp_path / "d", 20, shards=[0], spec=small_spec(n_points=65, engines={"label": "2"}))
+    make_run(tmp_path / "e", 20, candidates_per_scene=4, shards=[0])
     before = files_of(tmp_path / "a")
-    for other, problem in (("b", "runs of another specification"), ("c", "need 1"), ("d", "differs in kind")):
-        with pytest.raises(InputError, match=problem):
+    for other in "bc":
+        with pytest.raises(InputError, match="cannot hold runs of another specification or size of shards"):
             merge(tmp_path, [other], "a")
-    assert files_of(tmp_path / "a") == before
+    with pytest.raises(InputError) as refused:
+        merge(tmp_path, "ad")
+    for word in (f"{tmp_path}/a", f"{tmp_path}/d", "engines.label: None and '2'", "n_points: 64 and 65"):
+        assert word in str(refused.value)
+    with pytest.raises(InputError, match="candidates_per_scene: 4 and 5"):
+        merge(tmp_path, "ea")
+    assert not (tmp_path / "out").exists()
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign" / "thesis.tex").write_text("")
     with pytest.raises(InputError, match=r"thesis\.tex: holds other files"):
@@ -276,43 +298,111 @@ def test_what_cannot_be_added_to_a_place_is_refused_before_anything_is_written(t
     assert files_of(tmp_path / "a") == before
 
 
-def test_a_source_that_lacks_a_committed_file_is_refused(tmp_path: Path):
-    fill(tmp_path, [0], "a")
-    fill(tmp_path, [1], "b")
-    (tmp_path / "a" / "shards" / "000000" / "000000-a" / "label" / "c.0").unlink()
-    with pytest.raises(InputError, match=r"a/shards/000000/000000-a/label/c\.0: is missing"):
+def test_a_damaged_object_and_another_attempt_of_its_name_are_refused(tmp_path: Path) -> None:
+    run = fill(tmp_path, "a", [0])
+    fill(tmp_path, "b", [1])
+    storage = open_storage(tmp_path / "out")
+    storage.put("shards/000000-a-2.zip", b"of another attempt")
+    with pytest.raises(InputError, match=r"out/shards/000000-a-2\.zip: is another attempt of that name"):
         merge(tmp_path, "ab")
+    assert Run.open(storage).committed() == set()
+    for damage in (lambda p: p.write_bytes(p.read_bytes()[:-1]), Path.unlink):
+        damage(folder_of(run) / "shards/000000-a-2.zip")
+        with pytest.raises(InputError, match=r"a/shards/000000-a-2\.zip: (has other bytes|no such file)"):
+            merge(tmp_path, "ab", "new")
 
 
-def test_sealed_sources_stay_readable_and_linked(tmp_path: Path):
-    run = fill(tmp_path, [0, 1], "a", n=20)
-    fill(tmp_path, [2], "b")
+def test_sources_are_not_changed(tmp_path: Path) -> None:
+    run = fill(tmp_path, "a", [0, 1], n=20)
+    fill(tmp_path, "b", [2])
     seal(run.storage)
     before = files_of(tmp_path / "a")
     merge(tmp_path, "ab")
     assert files_of(tmp_path / "a") == before
-    chunk = "shards/000000/000000-a/label/c.0"
-    assert (tmp_path / "a" / chunk).stat().st_ino == (tmp_path / "out" / chunk).stat().st_ino
-    assert (tmp_path / "out" / chunk).stat().st_nlink == 4  # both runs and both stores
 
 
-def test_merging_on_s3_gives_the_same_files(tmp_path: Path, bucket: str):
-    manifest = manifest_of(small_spec(), Run.open(fill(tmp_path, [], "x").storage).layout)
-    other = manifest_of(small_spec(1), manifest.layout)
-    for name, kind, shards in (("a", manifest, [0, 1]), ("b", manifest, [1, 2]), ("c", other, [0])):
-        run = Run.create_or_open(open_storage(f"{bucket}/{name}"), kind, 40)
-        for shard in shards:
-            assert attempt(run, shard, f"{shard:06d}-{name}")
-    for _ in range(2):
-        merge(bucket, "abc")
-    merge(bucket, "ab", "ab")
-    merge_runs(plan_merge([f"{bucket}/{name}" for name in ("ab", "c")], str(tmp_path / "here")))
-    place = open_storage(f"{bucket}/out")
-    there = {f.key: place.get(f.key, 2**30) for f in place.list("")}
-    assert there.keys() >= {"merged.json", f"{part_folder(manifest.spec_hash)}/lineage.json"}
-    here = files_of(tmp_path / "here")
-    assert {k: v for k, v in there.items() if not k.startswith("data.zarr")} == {
-        k: v for k, v in here.items() if not k.startswith("data.zarr")
-    }
-    assert label_counts(open_runs(place)) == label_counts(open_runs(tmp_path / "here"))
-    assert sealed_root(place) == sealed_root(open_storage(tmp_path / "here"))
+# Conflicts ------------------------------------------------------------------------------------
+
+Change = Callable[[Tables], None]
+
+
+def changed(folder: Path, who: str, shard: int, change: Change | None = None, size: int = 2) -> Run:
+    """A run that holds one shard, whose rows were changed before they were written."""
+    run = make_run(folder / who, 40, size, shards=[])
+    tables = rows_of(run, shard)
+    if change is not None:
+        change(tables)
+    commit_object(run, shard, encoded(run, tables), who)
+    return run
+
+
+def flips(*rows: int) -> Change:
+    def flip(tables: Tables) -> None:
+        tables[1]["label"][list(rows)] ^= 1
+
+    return flip
+
+
+def first_zero(sign: float) -> Change:
+    return lambda tables: tables[1]["distance_m"].__setitem__(3, np.copysign(0.0, sign))
+
+
+def sets(field: str, row: int, value: Any) -> Change:
+    return lambda tables: tables[field in tables[1]][field].__setitem__(row, value)
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "row", "field"),
+    [
+        (None, flips(6, 9), 6, "label"),  # the first sample
+        (
+            None,
+            lambda t: (flips(2)(t), sets("distance_m", 2, 0.5)(t)),
+            2,
+            "distance_m",
+        ),  # the schema's first field
+        (None, sets("house_id", 1, "another"), 5, "house_id"),
+        (None, sets("redraws", 1, 7), 5, "redraws"),
+        (first_zero(1.0), first_zero(-1.0), 3, "distance_m"),  # bit for bit
+    ],
+)
+def test_other_rows_are_refused_naming_the_first_sample_and_field(
+    ours: Change | None, theirs: Change, row: int, field: str, tmp_path: Path
+) -> None:
+    one = changed(tmp_path, "a", 0, ours)
+    changed(tmp_path, "b", 0, theirs)
+    sample = rows_of(one, 0)[1]["sample_id"][row].tobytes().hex()
+    told = (
+        f"a: shard 0: {tmp_path}/b has other rows, first in sample {sample}, in {field}. Run `datagen verify`"
+    )
+    with pytest.raises(InputError) as refused:
+        merge(tmp_path, "ab")
+    assert told in str(refused.value) and not (tmp_path / "out").exists()
+
+
+def test_equal_rows_in_other_bytes_are_no_conflict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = changed(tmp_path, "a", 0)
+    monkeypatch.setattr("datagen.schemas.shard_files.ZSTD_LEVEL", 19)  # as another version of the compressor
+    other = changed(tmp_path, "b", 0)
+    assert one.commit_of(0).object.sha256 != other.commit_of(0).object.sha256
+    merge(tmp_path, "ab")
+    assert Run.open(tmp_path / "out").commit_of(0).attempt == "a"
+
+
+def test_every_common_scene_of_shards_of_other_sizes_is_compared_and_no_other(tmp_path: Path) -> None:
+    small = changed(tmp_path, "small", 1)  # scenes 2 and 3
+    for scene, size in ((1, 4), (0, 3)):
+        large = changed(tmp_path, f"apart-{size}", 0, flips(5 * scene), size)
+        refuse_different_rows(small, 1, large, 0)
+        refuse_different_rows(large, 0, small, 1)
+    changed(tmp_path, "odd", 0, flips(15), 4)
+    with pytest.raises(
+        InputError, match=r"odd: shard 0: .*small has other rows, first in sample .*, in label"
+    ):
+        merge(tmp_path, ["small", "odd"])
+    # Of three sizes: scene 7 is in b and c, whose first common scene is in a too.
+    changed(tmp_path, "a", 0, None, 6)
+    changed(tmp_path, "b", 1, None, 5)
+    changed(tmp_path, "c", 1, flips(15), 4)
+    with pytest.raises(InputError, match=r"b: shard 1: .*c has other rows"):
+        merge(tmp_path, "abc")

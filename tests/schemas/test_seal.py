@@ -5,9 +5,7 @@ from __future__ import annotations
 import subprocess
 import threading
 import warnings
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,17 +14,30 @@ import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.schemas import shard_files
+from datagen.schemas import shard_files, stored_arrays
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import Layout
 from datagen.schemas.sealing import seal, store_record
 from datagen.schemas.shard_sources import ZipFiles
 from datagen.schemas.specification import Source
-from datagen.schemas.storage import Storage, open_storage
+from datagen.schemas.storage import open_storage
 from datagen.train.run_parts import open_parts
 from tests.made_runs import attempt, files_of, make_run, manifest_of, small_spec, write
-from tests.schemas.checked import assert_rows, check, expected, fill, folder_of, found, merge, stored, tree
+from tests.schemas.checked import (
+    Changes,
+    Killed,
+    assert_rows,
+    check,
+    dies_at,
+    expected,
+    fill,
+    folder_of,
+    found,
+    merge,
+    stored,
+    tree,
+)
 
 
 def of(run: Run, *shards: int) -> list[tuple[Run, int]]:
@@ -79,8 +90,8 @@ def test_a_store_states_conventions_source_licences_and_coordinates(tmp_path: Pa
 
 
 def clear_metadata() -> None:
-    shard_files.group_metadata.cache_clear()
-    shard_files._made_by_zarr.cache_clear()
+    for made_once in (shard_files.group_metadata, shard_files._made_by_zarr, stored_arrays.arrays_of):
+        made_once.cache_clear()
 
 
 @pytest.mark.usefixtures("few_arrays")
@@ -226,34 +237,6 @@ def test_a_disk_that_fills_up_keeps_what_is_committed_and_continues_with_room(ti
     assert run.commit(write(run, len(done), "b"))
     assert seal(run.storage) == f"{tiny_disk}/data.zarr"
     assert_rows(stored(run.storage), expected(of(run, *done, len(done))))
-
-
-class Killed(BaseException):
-    """The end of a process: none of its later changes is made either."""
-
-
-class Changes:
-    """Counts the changes that a thread makes to storages; `before` is called before each."""
-
-    def __init__(self, patch: pytest.MonkeyPatch, before: Callable[[int], None]) -> None:
-        self.made = 0
-        for name in ("put", "put_new", "delete", "sync", "remove_empty"):
-            plain = getattr(Storage, name)
-
-            def change(storage: Storage, *arguments: Any, plain: Callable[..., Any] = plain) -> Any:
-                self.made += 1
-                before(self.made)
-                return plain(storage, *arguments)
-
-            patch.setattr(Storage, name, change)
-
-
-def dies_at(number: int) -> Callable[[int], None]:
-    def die(made: int) -> None:
-        if made >= number:
-            raise Killed
-
-    return die
 
 
 @pytest.mark.usefixtures("few_arrays")
