@@ -28,6 +28,8 @@ Array = npt.NDArray[Any]
 MAX_META_BYTES = 2**20
 MAX_DECODED_BYTES = 2**30  # far above any real chunk
 _MAX_PER_FILE = 2**20
+_NUMBERS = {"bool", "float16", "float32", "float64"}
+_NUMBERS |= {f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)}
 DAMAGE_FIX = "Restore the file from a copy, or set the shard aside with `datagen verify --repair`"
 
 
@@ -68,9 +70,9 @@ def parse_metadata(place: str, name: str, data: bytes) -> StoredArray:
             codecs = inner
         names = tuple(codec["name"] for codec in codecs)
         first = "vlen-utf8" if dtype == "string" else "bytes"
-        item_bytes = 1 if dtype == "string" else np.dtype(dtype).itemsize
-        if dtype != "string" and np.dtype(dtype).kind not in "biuf":
+        if dtype != "string" and dtype not in _NUMBERS:
             raise ValueError(f"data type {dtype}")
+        item_bytes = 1 if dtype == "string" else np.dtype(dtype).itemsize
         if item_bytes > 1 and codecs[0]["configuration"]["endian"] != "little":
             raise ValueError("not little-endian")
         if meta["zarr_format"] != 3 or names != (first, "zstd", "crc32c"):
