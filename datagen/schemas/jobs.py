@@ -106,12 +106,12 @@ class Jobs:
             raise InputError(where, "", "exists already", "Start the job again: it gets another name")
 
     def put_state(self, state: JobState) -> None:
-        self._storage.put(f"jobs/{state.id}.state.json", encode_record(state))
+        self._storage.put(f"jobs/{state.id}.state.json", encode_record(state), durably=False)
 
     def ask_to_stop(self, job: str, at_once: bool) -> None:
         """Ask a job to stop. A request to stop at once is not replaced by a weaker one."""
         if self.stop_of(job) != "now":
-            self._storage.put(f"jobs/{job}.stop", b"now" if at_once else b"drain")
+            self._storage.put(f"jobs/{job}.stop", b"now" if at_once else b"drain", durably=False)
 
     def stop_of(self, job: str) -> Stop | None:
         """The request to stop a job; None for none."""

@@ -208,7 +208,6 @@ class Ledger:
         if kept.cost is None or noted is None or not is_guess(noted):
             return False
         self._storage.put(key, encode_record(kept))
-        self._storage.sync([key])
         return True
 
     def attempts(self) -> set[str]:

@@ -171,7 +171,7 @@ class Changes:
 
     def __init__(self, patch: pytest.MonkeyPatch, before: Callable[[int], None]) -> None:
         self.made = 0
-        for name in ("put", "put_new", "delete", "sync", "remove_empty"):
+        for name in ("put", "put_new", "delete", "remove_empty"):
             plain = getattr(Storage, name)
 
             def change(storage: Storage, *arguments: Any, plain: Callable[..., Any] = plain) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,11 +11,14 @@ import pytest
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMA_VERSION
-from datagen.schemas.record_files import copy_key, publish, signed_json
+from datagen.schemas.record_files import copy_key, publish
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import FileEntry, Layout, LedgerEntry, QuarantineRecord
 from datagen.schemas.storage import open_storage
-from tests.made_runs import check_digests, commit_of, files_of, make_run, manifest_of, small_spec, write
+from tests.made_runs import commit_of, files_of, make_run, manifest_of, small_spec, write
+from tests.schemas.checked import edit
+
+pytestmark = pytest.mark.usefixtures("few_arrays")
 
 
 def test_resume_is_planned_minus_commits(tmp_path: Path):
@@ -85,22 +87,18 @@ def test_of_racing_committers_one_wins_and_the_run_holds_its_attempt(tmp_path: P
     assert Run.open(tmp_path).commit_of(0).attempt == f"attempt-{won.index(True)}"
 
 
-def test_a_commit_without_its_files_is_refused(tmp_path: Path):
+def test_an_object_is_written_once_and_read_as_committed(tmp_path: Path):
     run = make_run(tmp_path, shards=[])
     commit = write(run, 0, "a")
-    victim = tmp_path / "shards/000000/a/label/c.0"
-    data = victim.read_bytes()
-    victim.unlink()
-    with pytest.raises(InputError, match=r"label/c\.0: is missing"):
-        run.commit(commit)
-    victim.write_bytes(data[:-1])
-    with pytest.raises(InputError, match="bytes, but"):
-        run.commit(commit)
-    victim.write_bytes(bytes([data[0] ^ 1]) + data[1:])
-    run.check_files(commit)
-    with pytest.raises(InputError, match=r"label/c\.0: sha256"):
-        check_digests(run, commit)
-    assert run.committed() == set()
+    with pytest.raises(InputError, match=r"shards/a\.zip: exists already"):
+        run.write_object("a", b"others")
+    assert run.committed() == set() and run.commit(commit) and run.read_object(commit)
+    path = tmp_path / "shards/a.zip"
+    data = path.read_bytes()
+    for changed in (data[:-1], data + b"x", bytes([data[0] ^ 1]) + data[1:]):
+        path.write_bytes(changed)
+        with pytest.raises(InputError, match=r"shards/a\.zip: has (other )?.*bytes"):
+            run.read_object(commit)
 
 
 def test_the_ledger_knows_who_began_and_who_never_ended(tmp_path: Path):
@@ -114,7 +112,8 @@ def test_the_ledger_knows_who_began_and_who_never_ended(tmp_path: Path):
     assert not run.ledger.end(end.model_copy(update={"outcome": "failed"}))
     (entry,) = run.ledger.ends()
     assert (entry.outcome, len(entry.stack)) == ("crashed", 20_000)
-    assert [s.attempt for s in run.ledger.unfinished()] == ["b", "c"]
+    assert [s.attempt for s in run.ledger.unfinished({"c"})] == ["b"]
+    assert run.ledger.end(end.model_copy(update={"attempt": "d"})) and run.ledger.attempts() == set("abcd")
 
 
 def test_quarantine_takes_a_shard_from_the_missing_until_it_is_committed(tmp_path: Path):
@@ -146,15 +145,7 @@ def test_other_names_in_commits_do_not_count(tmp_path: Path):
     assert run.committed() == {0}
 
 
-def edit(path: Path, **changes: Any) -> None:
-    record = json.loads(path.read_text())
-    del record["sha256"]
-    for key, value in changes.items():
-        record[key] = value
-    path.write_bytes(signed_json(record))
-
-
-FILE = {"path": "label/c.0", "size": 1, "sha256": "0" * 64}
+OBJECT = {"path": "a-0.zip", "size": 1, "sha256": "0" * 64}
 
 
 @pytest.mark.parametrize(
@@ -165,17 +156,16 @@ FILE = {"path": "label/c.0", "size": 1, "sha256": "0" * 64}
         ({"attempt": ""}, "attempt"),
         ({"attempt": "a\n"}, "attempt"),
         ({"attempt": "x" * 101}, "attempt"),
-        ({"files": [{**FILE, "path": "../../manifest.json"}]}, "files.0.path"),
-        ({"files": [{**FILE, "path": "/etc/passwd"}]}, "files.0.path"),
-        ({"files": [{**FILE, "path": "a//b"}]}, "files.0.path"),
-        ({"files": [{**FILE, "path": "a/./b"}]}, "files.0.path"),
-        ({"files": [{**FILE, "path": "a\\b"}]}, "files.0.path"),
-        ({"files": [{**FILE, "size": -1}]}, "files.0.size"),
-        ({"files": [{**FILE, "size": 2**70}]}, "files.0.size"),
-        ({"files": [{**FILE, "sha256": "xyz"}]}, "files.0.sha256"),
-        ({"files": None}, "files"),
+        ({"object": {**OBJECT, "path": "../../manifest.json"}}, "object.path"),
+        ({"object": {**OBJECT, "path": "/etc/passwd"}}, "object.path"),
+        ({"object": {**OBJECT, "path": "a-1.zip"}}, "path"),
+        ({"object": {**OBJECT, "size": -1}}, "object.size"),
+        ({"object": {**OBJECT, "size": 2**70}}, "object.size"),
+        ({"object": {**OBJECT, "sha256": "xyz"}}, "object.sha256"),
+        ({"object": None}, "object"),
         ({"shard": 1}, "shard"),
         ({"shard": -1}, "shard"),
+        ({"shard": 10**18}, "shard"),
         ({"spec_hash": "0" * 64}, "spec_hash"),
         ({"scenes": 10**9}, "scenes"),
         ({"samples": 0}, "samples"),
@@ -238,9 +228,9 @@ def test_an_edited_specification_is_noticed(tmp_path: Path):
 def test_runs_of_other_formats_and_versions_are_refused(tmp_path: Path):
     make_run(tmp_path, shards=[])
     edit(tmp_path / "manifest.json", format_version=99)
-    with pytest.raises(InputError, match="format_version: is 99, but this program reads 2"):
+    with pytest.raises(InputError, match="format_version: is 99, but this program reads 3"):
         Run.open(tmp_path)
-    edit(tmp_path / "manifest.json", format_version=2, schema_version=99)
+    edit(tmp_path / "manifest.json", format_version=3, schema_version=99)
     with pytest.raises(InputError, match="schema_version"):
         _ = Run.open(tmp_path).schema
     edit(tmp_path / "manifest.json", schema_version=SCHEMA_VERSION, schema_name="dreams")
@@ -261,7 +251,7 @@ def test_what_is_not_a_run(tmp_path: Path):
 def test_attempts_with_bad_names_cannot_be_committed(tmp_path: Path):
     run = make_run(tmp_path, shards=[])
     with pytest.raises(ValueError, match="attempt"):
-        commit_of(run, 0, "../x", (FileEntry(path="a", size=0, sha256="0" * 64),))
+        commit_of(run, 0, "../x", FileEntry(path="a", size=0, sha256="0" * 64))
 
 
 def test_what_a_killed_creator_began_is_completed_as_he_began_it(tmp_path: Path):

@@ -70,7 +70,6 @@ def _repair_once(storage: Storage, result: Repaired, refused: dict[str, str]) ->
     for key, cure in restores:
         with _noting(refused, key):
             storage.put(key, cure.data)
-            storage.sync([key])
             result.restored.append(key)
     if restores:
         return True

@@ -193,7 +193,6 @@ def _replace(storage: Storage, key: str, record: bytes) -> None:
     for name in (copy_key(key), key):
         if storage.get(name, MAX_RECORD_BYTES) != record:
             storage.put(name, record)
-            storage.sync([name])
 
 
 def _existing_storage(out: str) -> Storage | None:

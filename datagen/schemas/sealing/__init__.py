@@ -67,7 +67,6 @@ def seal(storage: Storage, tick: Tick = lambda done, total: None) -> str:
         raise
     new = StoreRecord(name=name, rows_sha256=digest, parts=parts, files=files)
     storage.put(RECORD, encode_record(new))
-    storage.sync([RECORD])
     if old is not None:
         remove_store(storage, old.name)
     return f"{storage.url}/{name}"
@@ -110,8 +109,7 @@ def _write(storage: Storage, name: str, contents: Contents, tick: Tick) -> Itera
     }
 
     def put(path: str, data: bytes) -> FileEntry:
-        storage.put(key := f"{name}/{path}", data)
-        storage.sync([key])
+        storage.put(f"{name}/{path}", data)
         return FileEntry.of(path, data)
 
     shards = list(contents.shards)

@@ -60,9 +60,12 @@ class Storage:
         """The storage of a subfolder, which need not exist."""
         return Storage(self._files.below(_checked(self.url, key)))
 
-    def put(self, key: str, data: bytes) -> None:
-        """Write a file, or replace it. Not durable before `sync`."""
-        self._try(key, lambda: self._files.put(key, data))
+    def put(self, key: str, data: bytes, durably: bool = True) -> None:
+        """Write a file, or replace it; after a power cut the name has the old bytes or the new ones.
+
+        Not so where it is written without `durably`: then it may be torn.
+        """
+        self._try(key, lambda: self._files.put(key, data, durably))
 
     def put_new(self, key: str, data: bytes) -> bool:
         """Write a file durably unless the key exists; False where it exists with other bytes.
@@ -76,8 +79,8 @@ class Storage:
             same = self._try(key, lambda: self._files.get(key, len(data))) == data
         except FileTooLarge:
             return False
-        if same:
-            self.sync([key])  # its writer may have stopped before
+        if same and isinstance(files := self._files, LocalFiles):
+            self._try(key, lambda: files.sync(key))  # its writer may have stopped before
         return same
 
     def get(self, key: str, limit_bytes: int) -> bytes | None:
@@ -130,12 +133,6 @@ class Storage:
         files = self._files
         if isinstance(files, LocalFiles):
             self._try(folder, lambda: files.remove_empty(folder))
-
-    def sync(self, keys: Iterable[str]) -> None:
-        """Make files and their folders up to the root durable; objects are durable already."""
-        files = self._files
-        if isinstance(files, LocalFiles):
-            files.sync(_checked(self.url, key) for key in keys)
 
     def _try(self, key: str, do: Callable[[], Result]) -> Result:
         _checked(self.url, key)

@@ -11,7 +11,7 @@ import errno
 import os
 import secrets
 import stat
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,7 +58,7 @@ class LocalFiles:
     def __init__(self, root: Path, prefix: tuple[str, ...] = ()) -> None:
         self.root, self.prefix = root, prefix
         self.folder = root.joinpath(*prefix)
-        self._durable: set[tuple[str, ...]] = set()  # folders whose own names this process made durable
+        self._durable: set[tuple[str, ...]] = set()  # folders whose own names are durable, from the root
 
     @staticmethod
     def make_root(folder: Path) -> None:
@@ -70,11 +70,13 @@ class LocalFiles:
     def below(self, key: str) -> LocalFiles:
         return LocalFiles(self.root, (*self.prefix, *key.split("/")))
 
-    def put(self, key: str, data: bytes) -> None:
+    def put(self, key: str, data: bytes, durably: bool) -> None:
         folders, name = _split(key)
         with _closing(self._walk(folders, make=True)) as here, _drafted(name, here) as draft:
-            _write(draft, data, here, durably=False)
+            _write(draft, data, here, durably)
             os.rename(draft, name, src_dir_fd=here, dst_dir_fd=here)
+        if durably:
+            self._sync_folders(folders)
 
     def create(self, key: str, data: bytes) -> bool:
         """Write a file durably unless the name exists; False where it does.
@@ -88,9 +90,7 @@ class LocalFiles:
                 os.link(draft, name, src_dir_fd=here, dst_dir_fd=here, follow_symlinks=False)
             except FileExistsError:
                 return False
-        # The folders above hold a new name only where the folder itself is new.
-        self._sync_folders([folders] if folders in self._durable else _with_parents(folders))
-        self._durable.add(folders)
+        self._sync_folders(folders)
         return True
 
     def get(self, key: str, limit_bytes: int) -> bytes | None:
@@ -142,33 +142,30 @@ class LocalFiles:
     def remove_empty(self, folder: str) -> None:
         """Remove a folder and its subfolders, where they hold no file."""
         folders, name = _split(folder)
+        self._durable.clear()
         with suppress(FileNotFoundError), _closing(self._walk(folders)) as here:
             for _, below, _, fd in os.fwalk(name, topdown=False, dir_fd=here):
                 for child in below:
                     _remove_folder(child, fd)
             _remove_folder(name, here)
 
-    def sync(self, keys: Iterable[str]) -> None:
-        """Call fsync on each file, and on each folder from there up to the root, leaves first.
+    def sync(self, key: str) -> None:
+        """Make a file of another process durable."""
+        with _closing(self._open_file(key)) as fd:
+            os.fsync(fd)
+        self._sync_folders(_split(key)[0])
 
-        InputError names the file or folder where it fails.
-        """
-        folders: set[tuple[str, ...]] = set()
-        for key in keys:
-            self._sync(key, lambda key=key: self._open_file(key))
-            folders.update(_with_parents(_split(key)[0]))
-        self._sync_folders(folders)
-
-    def _sync_folders(self, folders: Iterable[tuple[str, ...]]) -> None:
-        for folder in sorted(folders, key=len, reverse=True):
-            self._sync("/".join(folder), lambda folder=folder: self._walk(folder, flags=_FOLDER))
-
-    def _sync(self, key: str, open_it: Callable[[], int]) -> None:
-        try:
-            with _closing(open_it()) as fd:
-                os.fsync(fd)
-        except OSError as e:
-            raise storage_error(self.folder / key, e) from e
+    def _sync_folders(self, folders: tuple[str, ...]) -> None:
+        """Make a new name in a folder durable, and where the folder may be new, those of its parents."""
+        path, files = (*self.prefix, *folders), LocalFiles(self.root)
+        new = range(len(path), len(path) - 1 if path in self._durable else -1, -1)
+        for folder in (path[:depth] for depth in new):
+            try:
+                with _closing(files._walk(folder, flags=_FOLDER)) as fd:
+                    os.fsync(fd)
+            except OSError as e:
+                raise storage_error(self.root.joinpath(*folder), e) from e
+        self._durable.add(path)
 
     def _walk(self, folders: Sequence[str], make: bool = False, flags: int = _STEP) -> int:
         """Open a folder; the caller closes the descriptor. With `make`, missing ones are created."""
@@ -254,10 +251,6 @@ def _remove_folder(name: str, here: int) -> None:
     except OSError as e:
         if e.errno not in (*TAKEN, errno.ENOENT):
             raise
-
-
-def _with_parents(folders: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    return (folders[:depth] for depth in range(len(folders) + 1))
 
 
 def _step(name: str, here: int, make: bool, flags: int) -> int:

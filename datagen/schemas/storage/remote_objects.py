@@ -112,7 +112,7 @@ class RemoteObjects:
     def below(self, key: str) -> RemoteObjects:
         return RemoteObjects(f"{self.url}/{key}")
 
-    def put(self, key: str, data: bytes) -> None:
+    def put(self, key: str, data: bytes, durably: bool) -> None:
         self._try(key, lambda: obstore.put(self._store, key, data, use_multipart=False))
 
     def create(self, key: str, data: bytes) -> bool:
