@@ -13,15 +13,14 @@ from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import refuse_foreign
-from datagen.schemas.storage import Storage, local_files, open_storage
+from datagen.schemas.storage import Storage, open_storage
 from tests.made_runs import files_of
 
 VERBS: dict[str, Callable[[Storage, str], object]] = {
     "get": lambda s, key: s.get(key, 10**6),
     "get_many": lambda s, key: list(s.get_many([key], 10**6)),
     "exists": lambda s, key: s.exists(key),
-    "sync": lambda s, key: s.sync([key]),
-    "link": lambda s, key: s.adopt(s, key, "taken"),
+    "get_range": lambda s, key: s.get_range(key, -9, 9),
     "put_new": lambda s, key: s.put_new(key, b"x"),
     "below": lambda s, key: s.below(key).get("x", 9),
 }
@@ -161,34 +160,3 @@ def test_a_key_is_taken_exactly_if_its_parts_are_names(tmp_path_factory: pytest.
     else:
         with pytest.raises(InputError):
             s.put(key, b"x")
-
-
-@pytest.mark.parametrize("code", ["EXDEV", "EPERM", "EMLINK", "EOPNOTSUPP"])
-def test_where_no_link_can_be_the_bytes_are_copied(
-    code: str, place: Storage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    import errno
-
-    def refuse(*_: object, **__: object) -> None:
-        number = getattr(errno, code)
-        raise OSError(number, os.strerror(number))
-
-    theirs = open_storage(tmp_path / "theirs")
-    theirs.put("x", b"12" * 10**6)
-    place.put("y", b"before")
-    monkeypatch.setattr(local_files.os, "link", refuse)
-    place.adopt(theirs, "x", "y")
-    monkeypatch.undo()
-    assert place.get("y", 10**7) == b"12" * 10**6
-    assert files_of(place.folder).keys() == {"y"}  # type: ignore[arg-type]
-
-
-def test_a_disk_of_its_own_is_copied_to(place: Storage, tiny_disk: Path):
-    there = open_storage(tiny_disk)
-    place.put("small", b"x" * 1000)
-    there.adopt(place, "small", "a/small")
-    assert there.get("a/small", 1000) == b"x" * 1000
-    place.put("large", b"x" * 2_000_000)
-    with pytest.raises(InputError, match="No space left on device"):
-        there.adopt(place, "large", "a/large")
-    assert files_of(tiny_disk).keys() == {"a/small"}

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import pickle
 import socket
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
 
 import pytest
 from obstore.exceptions import GenericError
@@ -34,86 +32,6 @@ def behind(bucket: str, s3_port: int, monkeypatch: pytest.MonkeyPatch) -> Behind
             yield open_storage(f"{bucket}/runs/a", probe=False)
 
     return open_behind
-
-
-def test_the_verbs_are_those_of_a_folder(bucket: str):
-    s = open_storage(f"{bucket}/runs/a/")
-    assert (s.url, s.folder) == (f"{bucket}/runs/a", None)
-    s.put("a/b", b"12")
-    s.put("a/b", b"123")
-    s.put("ab/c", b"")
-    s.sync(["a/b"])
-    assert s.get("a/b", 10) == b"123" and s.get("a/none", 10) is None
-    assert [(f.key, f.size) for f in s.list("a")] == [("a/b", 3)]
-    assert sorted(f.key for f in s.list("")) == ["a/b", "ab/c"]
-    assert list(s.list("none")) == []
-    s.adopt(s, "a/b", "x/y")
-    s.delete(["a/b", "a/none"])
-    assert (s.exists("a/b"), s.exists("x/y")) == (False, True)
-    again: Storage = pickle.loads(pickle.dumps(s))
-    assert again.get("x/y", 9) == b"123"
-    assert s.below("x").get("y", 9) == b"123"
-    with pytest.raises(InputError, match="3 bytes, more than the 2"):
-        s.get("x/y", 2)
-    with pytest.raises(InputError, match="not the name of a file below the root"):
-        s.get("../b/secret", 9)
-    assert open_storage(bucket).get("runs/a/x/y", 9) == b"123"
-
-
-def test_many_files_at_once_come_back_in_order(bucket: str):
-    s = open_storage(bucket)
-    files = {f"k/{i:03d}": b"%d" % i for i in range(60)}
-    s.put_many(files)
-    keys = [*reversed(files), "none"]
-    assert list(s.get_many(keys, 9)) == [*((k, files[k]) for k in reversed(files)), ("none", None)]
-    s.put("k/000", b"other")
-    assert {f.key: f.size for f in s.list("k")} == {
-        k: len(v) for k, v in (files | {"k/000": b"other"}).items()
-    }
-    with pytest.raises(InputError, match="more than the 1 that"):
-        list(s.get_many(files, 1))
-    s.delete(files)
-    assert list(s.list("k")) == []
-
-
-def test_a_file_is_adopted_from_wherever_it_lies(bucket: str, tmp_path):
-    local = open_storage(tmp_path)
-    a, b = open_storage(f"{bucket}/a"), open_storage(f"{bucket}/b/c")
-    local.put("x", b"local")
-    a.adopt(local, "x", "from/local")
-    b.adopt(a, "from/local", "from/a")
-    local.adopt(b, "from/a", "back")
-    assert (b.get("from/a", 9), local.get("back", 9)) == (b"local", b"local")
-    for ours, theirs in ((a, b), (a, local), (local, a)):
-        with pytest.raises(InputError, match="none: no such file"):
-            ours.adopt(theirs, "none", "y")
-    with pytest.raises(InputError, match="more than the 2"):
-        a.adopt(local, "x", "y", limit_bytes=2)
-
-
-@pytest.mark.parametrize(("to", "of"), [("here", "disk"), ("here", "s3"), ("s3", "here"), ("s3", "s3")])
-def test_many_files_are_adopted_or_the_one_that_cannot_be_is_named(
-    to: str, of: str, bucket: str, tmp_path: Path
-):
-    ours, theirs = (
-        open_storage(f"{bucket}/{side}" if kind == "s3" else tmp_path / side)
-        for side, kind in (("ours", to), ("theirs", of))
-    )
-    files = {f"k/{i:02d}": b"%d" % i for i in range(40)}
-    theirs.put_many(files)
-    ours.adopt_many(theirs, ((key, f"taken/{key}") for key in files), limit_bytes=2)
-    assert dict(ours.get_many((f"taken/{key}" for key in files), 2)) == {
-        f"taken/{key}": data for key, data in files.items()
-    }
-    pairs = [(key, f"half/{key}") for key in files]
-    pairs[17] = ("k/none", "half/none")
-    with pytest.raises(InputError, match="k/none: no such file"):
-        ours.adopt_many(theirs, pairs)
-    there = {file.key for file in ours.list("half")}  # and no more to come
-    assert {target for _, target in pairs[:17]} <= there and len(there) < 39
-    ours.adopt_many(theirs, [])
-    with pytest.raises(InputError, match="not the name of a file below the root"):
-        ours.adopt_many(theirs, [("k/00", "../out")])
 
 
 def test_of_racing_writers_exactly_one_wins(behind: Behind):
@@ -145,27 +63,27 @@ def test_what_was_done_and_answered_by_an_error_is_done(behind: Behind):
         for verb in (
             lambda: s.put("p", b"1"),
             lambda: s.delete(["p", "none"]),
-            lambda: s.adopt(s, "c/0", "copy"),
             lambda: s.exists("c/0"),
         ):
             faults.script = ["lost_answer"]
             verb()
-        assert (s.exists("p"), s.get("copy", 9)) == (False, b"ours")
+        assert not s.exists("p")
 
 
 def test_answers_that_break_off_are_asked_for_again(behind: Behind):
     faults = Faults()
     with behind(faults) as s:
-        s.put_many({f"k/{i}": b"%d" % i * 1000 for i in range(20)})
+        for i in range(20):
+            s.put(f"k/{i}", b"%d" % i * 1000)
         faults.script = ["cut", "cut"]
         assert s.get("k/7", 2000) == b"7" * 1000
         faults.script = ["cut", "error", "cut"]
         assert len(list(s.list("k"))) == 20
         faults.script = ["cut", "error", "lost_answer"] * 4
         assert len(dict(s.get_many([f"k/{i}" for i in range(20)], 2000))) == 20
-        faults.late_error_of_copies = 1
-        s.adopt(s, "k/1", "copy")
-        assert s.get("copy", 2000) == b"1" * 1000
+        for start in (10, -500):
+            faults.script = ["cut", "error", "cut"]
+            assert s.get_range("k/7", start, 500) == b"7" * 500
 
 
 def test_a_store_that_ignores_create_only_is_refused(behind: Behind, bucket: str):
@@ -186,7 +104,7 @@ def test_a_store_that_is_down_is_told_within_the_bound(behind: Behind, monkeypat
             lambda: s.put_new("a", b""),
             lambda: s.get("a", 9),
             lambda: list(s.list("")),
-            lambda: s.put_many({"a": b"", "b": b""}),
+            lambda: s.get_range("a", -9, 9),
         ):
             before = faults.seen["requests"]
             with pytest.raises(
