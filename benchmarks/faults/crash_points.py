@@ -1,6 +1,6 @@
 """A kill, a failing disk and a full one at every call by which operations change a run, as a table.
 
-    python -m benchmarks.faults.crash_points [--only seal --only unseal] [--sample 20]
+    python -m benchmarks.faults.crash_points [--only seal --only clean] [--sample 20]
 
 Points are: a kill before each call that changes a file, a kill after half the bytes of each write, an
 input/output error of each call, and a disk that is full from each call on. After each, a fresh process

@@ -6,7 +6,7 @@ The server is moto's, on the loopback address. A share `rate` of all requests fa
 refused with 500 or 503; one fifth each is done and answered 500, done and cut off in its answer, and held
 until the client times out, done or not. Every third create-only put is done and answered 500. The store is
 down for a while five times per campaign, twice right after it has stored a commit. Each campaign ends with a
-check of every byte: committed files, copies of commits and the sealed store equal those of an undisturbed
+check of every byte: committed objects and the sealed store equal those of an undisturbed
 local run, and the ledger has every execution once, with its end. Anything else raises AssertionError.
 """
 

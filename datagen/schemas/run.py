@@ -34,6 +34,7 @@ from datagen.schemas.record_files import (
     utc_now,
 )
 from datagen.schemas.run_records import (
+    MAX_FILE_BYTES,
     Commit,
     FileEntry,
     Layout,
@@ -223,6 +224,9 @@ class Run:
 
     def write_object(self, attempt: str, data: bytes) -> FileEntry:
         """Write an attempt's rows durably, and return the entry for its commit."""
+        if len(data) > MAX_FILE_BYTES:
+            problem = f"has {len(data):,} bytes, more than 2 GiB"
+            raise InputError(f"shard of attempt {attempt}", "", problem, "Choose fewer --scenes-per-shard")
         if not self.storage.put_new(object_key(attempt), data):
             place = f"{self.storage.url}/{object_key(attempt)}"
             raise InputError(place, "", "exists already", "Give every attempt its own name")

@@ -130,11 +130,14 @@ class Merged(StoredRecord):
     parts: tuple[MergedPart, ...] = Field(min_length=2)
 
 
+MAX_FILE_BYTES = 2**31  # of an object, or of a file of a sealed store; one is read as a whole
+
+
 class FileEntry(StoredRecord):
     """One file: its path below the folder that its record describes, its size and its digest."""
 
     path: FilePath
-    size: int = Field(ge=0, le=2**40)
+    size: int = Field(ge=0, le=MAX_FILE_BYTES)
     sha256: Digest
 
     @classmethod

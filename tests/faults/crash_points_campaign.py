@@ -194,7 +194,7 @@ def _try(
             if "\n" in told:
                 violated(f"an error of several lines: {told}")
             if call.kind not in ("unlink", "rmdir"):
-                for name in _drafts(files_below(place), known, operation.shared):
+                for name in _drafts(files_below(place), known):
                     violated(f"left behind: {name}")
         elif status != 0:
             violated(f"ended with {status}: {told}")
@@ -202,7 +202,8 @@ def _try(
         violated(f"ended with {status}: {told}")
     ended = status == 0
     for name, data in known.before_files.items():
-        if known.after_files.get(name) == data and bytes_of(place / name) != data:
+        is_kept = known.after_files.get(name) == data and not re.search(r"(^|/)data[-.]", name)  # a unit
+        if is_kept and bytes_of(place / name) != data:
             violated(f"changed {name}")
     # One fresh process looks, goes on as a user would, and looks again.
     now, resumed, damaged = _look_and_resume(place, operation)
@@ -216,23 +217,16 @@ def _try(
         violated(f"resumed, and damaged: {what}")
 
 
-def _drafts(now: Iterable[str], known: _Reference, shared: bool) -> list[str]:
-    """New files that belong to nothing: drafts, and those of an attempt that is not written whole.
+def _drafts(now: Iterable[str], known: _Reference) -> list[str]:
+    """New files that belong to nothing: drafts, and those of a sealed store that is not written whole.
 
-    One that is, and lacks only its commit, is left to `verify --clean`: its commit may be on its way.
+    An object or a store that is, and lacks only its record, is left to `verify --clean`: its record may be
+    on its way.
     """
-    drafts: list[str] = []
-    by_attempt: dict[str, set[str]] = {}
-    for name in now:
-        if found := re.match(r"(.*/)?shards/[0-9]+/[^/]+/", name):
-            by_attempt.setdefault(found[0], set()).add(name)
-        if re.search(r"\.(part|partial)\b", name):
-            drafts.append(name)
-    for folder, there in by_attempt.items():
-        whole = {name for name in known.after_files if name.startswith(folder)}
-        if whole - there - {f"{folder}commit.json"} and not shared:
-            drafts += there
-    return sorted(set(drafts) - known.before_files.keys())
+    new = set(now) - known.before_files.keys()
+    stores = {name: found[0] for name in new if (found := re.match(r"(?:.*/)?data(?:-[0-9]+)?\.zarr/", name))}
+    half = {store for store in stores.values() if f"{store}zarr.json" not in now}
+    return sorted(name for name in new if name.endswith(".part") or stores.get(name) in half)
 
 
 def _judge(
@@ -246,7 +240,7 @@ def _judge(
             continue  # the account of a new attempt follows its commit, or comes with who resumes
         if value == new:
             states.add("there")
-        elif value == old:
+        elif value == old or (value is None and (old or "").startswith("refused")):  # set aside
             states.add("absent")
         else:
             violated(f"{name} is {value!r}, was {old!r}, should be {new!r}")

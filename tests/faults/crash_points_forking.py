@@ -48,19 +48,10 @@ def in_child(do: Callable[[], str | None]) -> tuple[int, str]:
 
 
 def copy_tree(source: Path, target: Path) -> None:
-    """A copy in which names that share a file share one again."""
+    """A copy in place of what is there; none where there is no source."""
     shutil.rmtree(target, ignore_errors=True)
-    if not source.exists():
-        return
-    seen: dict[int, Path] = {}
-    for path in [source, *sorted(source.rglob("*"))]:
-        copy = target / path.relative_to(source)
-        if path.is_dir():
-            copy.mkdir()
-        elif (first := seen.setdefault(path.stat().st_ino, copy)) != copy:
-            os.link(first, copy)
-        else:
-            shutil.copy(path, copy)
+    if source.exists():
+        shutil.copytree(source, target)
 
 
 def files_below(folder: Path) -> dict[str, bytes]:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
+from uuid import uuid4
 
 from datagen.cluster.run_recorder import close_lost_attempts
 from datagen.relabelling import relabel_run, relabelled_specification
@@ -16,12 +17,12 @@ from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS, RecordSchema
 from datagen.schemas.merging import merge_runs, plan_merge
-from datagen.schemas.record_files import MERGED, encode_record, part_folder, publish
+from datagen.schemas.record_files import MERGED
 from datagen.schemas.run import Run, open_runs
-from datagen.schemas.run_records import Layout, LedgerEntry, Merged, QuarantineRecord
-from datagen.schemas.sealing import SEALED, seal, unseal
+from datagen.schemas.run_records import Layout, LedgerEntry, QuarantineRecord
+from datagen.schemas.sealing import SEALED, seal, store_record
 from datagen.schemas.storage import open_storage
-from tests.made_runs import attempt, check_digests, files_of, make_run, manifest_of, small_spec, write
+from tests.made_runs import attempt, files_of, flip, make_run, manifest_of, small_spec, write
 
 # A shard of few files, so that every call of every operation can be tried. All that these tests and the
 # code below them need of a schema is there: names, texts, a vector, both tables.
@@ -40,9 +41,7 @@ _HEURISTIC = SCHEMAS["heuristic"]
 class Operation:
     """`prepare` makes what is there before, in a new folder; `act` is what is killed; `resume` is what
     the user does then (the same again, where it is not given). `places` are the runs in the folder;
-    `exact` operations, resumed, leave the very files that they leave undisturbed. Attempts of merges have
-    the names that they have in the sources, and another merge may be at them: `shared` ones are not taken
-    back when the disk refuses, as they are links and take no room."""
+    `exact` operations, resumed, leave the very files that they leave undisturbed."""
 
     name: str
     prepare: Callable[[Path], None]
@@ -51,7 +50,6 @@ class Operation:
     places: tuple[str, ...] = ("",)
     fields: tuple[str, ...] = _KEPT
     exact: bool = False
-    shared: bool = False
 
 
 def small_schema(fields: Iterable[str] = _KEPT) -> RecordSchema:
@@ -81,16 +79,18 @@ def _units(folder: Path) -> Units:
     except InputError as e:
         return found | {"refused": e.problem}
     for run in runs:
-        name = run.manifest.spec_hash[:8]
-        found[f"{name} manifest"] = f"{run.manifest.spec_hash} {run.layout}"
+        name, size = run.manifest.spec_hash[:8], run.layout.scenes_per_shard
+        name = f"{name}-{size}"
+        found[f"{name} manifest"] = f"{run.manifest.spec_hash} {run.layout} {run.scenes}"
         if run.n:
             found[f"{name} n"] = str(run.n)
+        attempts: set[str] = set()
         for shard in sorted(run.committed()):
-            found[f"{name} commit {shard}"] = _commit(run, shard)
+            found[f"{name} commit {shard}"] = _commit(run, shard, attempts)
         found[f"{name} quarantine"] = str(sorted(run.quarantined()))
         for entry in run.ledger.ends():
             found[f"ledger {name} end {entry.attempt}"] = entry.outcome
-        for start in run.ledger.unfinished():
+        for start in run.ledger.unfinished(attempts):
             found[f"ledger {name} begun {start.attempt}"] = str(start.shard)
     return found
 
@@ -106,21 +106,25 @@ def damage(folder: Path, places: Iterable[str] = ("",)) -> list[str]:
     ]
 
 
-def _commit(run: Run, shard: int) -> str:
+def _commit(run: Run, shard: int, attempts: set[str]) -> str:
     try:
         commit = run.commit_of(shard)
-        check_digests(run, commit)
+        attempts.add(commit.attempt)
+        return sha256(run.read_object(commit)).hexdigest()
     except InputError as e:
         return f"refused: {e.problem}"
-    rows = sorted((entry.path, entry.sha256) for entry in commit.files)
-    return sha256(json.dumps(rows).encode()).hexdigest()
 
 
 def _sealed(folder: Path) -> str:
-    """The digest of the sealed store's files; "" where there is none."""
-    files = files_of(folder / SEALED)
-    digests = {key: sha256(data).hexdigest() for key, data in files.items()}
-    return sha256(json.dumps(digests).encode()).hexdigest() if files else ""
+    """The digest of the files of the store that counts, if undamaged, whatever its name; else ""."""
+    try:
+        record = store_record(open_storage(folder, probe=False)) if folder.exists() else None
+    except InputError as e:
+        return f"refused: {e.problem}"
+    found = files_of(folder / record.name) if record else {}
+    digests = {path: sha256(data).hexdigest() for path, data in found.items()}
+    whole = record is not None and digests == {entry.path: entry.sha256 for entry in record.files}
+    return sha256(json.dumps(digests, sort_keys=True).encode()).hexdigest() if whole else ""
 
 
 # Operations ----------------------------------------------------------------------------------
@@ -146,8 +150,8 @@ def _guess(folder: Path) -> None:
 
 def _account(folder: Path) -> None:
     run = Run.open(folder)
-    known = next(entry for entry in run.ledger.ends() if entry.attempt == "a-0")
-    run.ledger.end(LedgerEntry(attempt="b", shard=1, outcome="failed", cause="a cause", cost=known.cost))
+    cost = run.commit_of(0).cost
+    run.ledger.end(LedgerEntry(attempt="b", shard=1, outcome="failed", cause="a cause", cost=cost))
 
 
 def _give_up(folder: Path) -> None:
@@ -169,13 +173,6 @@ def _sealed_and_grown(folder: Path) -> None:
     make_run(folder, 33)
 
 
-def _merged(folder: Path) -> None:
-    specs = sorted((small_spec(0), small_spec(1)), key=lambda spec: spec.hash())
-    for spec in specs:
-        make_run(folder / part_folder(spec.hash()), 15, spec=spec)
-    publish(open_storage(folder), MERGED, encode_record(Merged(parts=tuple(spec.hash() for spec in specs))))
-
-
 def _run(folder: Path, n: int, shards: list[int] | None) -> None:
     make_run(folder, n, shards=shards)
 
@@ -184,41 +181,60 @@ def _seal(folder: Path) -> None:
     seal(open_storage(folder, probe=False))
 
 
-def _apart(folder: Path, seeds: tuple[int, int]) -> None:
-    for name, seed, shards in (("a", seeds[0], [0, 1]), ("b", seeds[1], [1, 2])):
-        make_run(folder / name, 30, shards=shards, spec=small_spec(seed))
+def _apart(folder: Path, seeds: tuple[int, int] = (0, 0), sizes: tuple[int, int] = (2, 2)) -> None:
+    for name, seed, size, shards in (("a", seeds[0], sizes[0], [0, 1]), ("b", seeds[1], sizes[1], [1, 2])):
+        run = make_run(folder / name, 30, size, shards=[], spec=small_spec(seed))
+        for shard in shards:
+            attempt(run, shard, f"{name}-{shard}")
 
 
 def _merge(folder: Path) -> None:
     merge_runs(plan_merge([str(folder / "a"), str(folder / "b")], str(folder / "out")))
 
 
+def _merged_and_grown(folder: Path) -> None:
+    _apart(folder, (0, 1))
+    _merge(folder)
+    for run in open_runs(folder / "out"):
+        for shard in run.missing():
+            attempt(run, shard, f"c-{shard}")
+
+
 def _damaged_records(folder: Path) -> None:
     run = make_run(folder, 30)
-    run.ledger.start("lost", 1)
-    _flip(folder / "commits/000001.json")
+    run.ledger.start("lost", 0)
+    flip(folder / "commits/000001.json")
     (folder / "copies/manifest.json").unlink()
-    (folder / "ledger/a-2.json").unlink()
+    (folder / "ledger/a-2.start.json").unlink()
     (folder / "copies/plans/1.json").write_bytes(b"")
 
 
 def _damaged_manifest(folder: Path) -> None:
     make_run(folder, 20)
-    _flip(folder / "manifest.json")
+    flip(folder / "manifest.json")
 
 
 def _damaged_files(folder: Path) -> None:
     seal(make_run(folder, 30).storage)
-    _flip(folder / "shards/000001/a-1/label/c.0")
-    (folder / "shards/000002/a-2/zarr.json").unlink()
-    _flip(folder / SEALED / "house_id" / "zarr.json")
+    flip(folder / "shards/a-1.zip")
+    (folder / "shards/a-2.zip").unlink()
+    flip(folder / SEALED / "house_id/zarr.json")
 
 
-def _flip(path: Path) -> None:
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 16
-    path.chmod(0o644)
-    path.write_bytes(data)
+def _repair_and_resume(folder: Path) -> None:
+    repair_runs(open_storage(folder, probe=False))
+    remake(folder)
+    _repair(folder)
+
+
+def remake(folder: Path) -> None:
+    """Make the missing shards, close what was left open, and seal, as `datagen resume` does."""
+    storage = open_storage(folder, probe=False, create=False)
+    for run in open_runs(storage):
+        for shard in run.missing():
+            attempt(run, shard, f"again-{shard}-{uuid4().hex[:8]}")
+        close_lost_attempts(run)
+    seal(storage)
 
 
 def _repair(folder: Path) -> None:
@@ -231,9 +247,9 @@ def _littered(folder: Path) -> None:
     run = make_run(folder, 30, shards=[0, 1])
     write(run, 1, "loser")
     write(run, 2, "late")
-    for draft in (f"{SEALED}.{7:016x}.partial/label", f"{SEALED}.{7:016x}.partial/rgb"):
-        (folder / draft).mkdir(parents=True)
-        (folder / draft / "c.0").write_bytes(b"1")
+    for array in ("label", "rgb"):
+        (folder / SEALED / array).mkdir(parents=True)
+        (folder / SEALED / array / "c.0").write_bytes(b"1")
     (folder / f"commits/000002.json.{7:016x}.part").write_bytes(b"{}")
 
 
@@ -266,13 +282,13 @@ OPERATIONS = (
     Operation("quarantine", lambda folder: _run(folder, 20, [0]), _give_up),
     Operation("seal", lambda folder: _run(folder, 15, None), _seal),
     Operation("seal again", _sealed_and_grown, _seal),
-    Operation("seal merged", _merged, _seal),
-    Operation("unseal", _sealed_and_grown, lambda folder: unseal(open_storage(folder, probe=False))),
-    Operation("merge one", lambda f: _apart(f, (0, 0)), _merge, places=("out",), shared=True),
-    Operation("merge several", lambda f: _apart(f, (0, 1)), _merge, places=("out",), shared=True),
+    Operation("seal merged", _merged_and_grown, lambda f: _seal(f / "out"), places=("out",)),
+    Operation("merge one", _apart, _merge, places=("out",)),
+    Operation("merge several", lambda f: _apart(f, (0, 1)), _merge, places=("out",)),
+    Operation("merge sizes", lambda f: _apart(f, sizes=(2, 1)), _merge, places=("out",)),
     Operation("repair manifest", _damaged_manifest, _repair),
     Operation("repair records", _damaged_records, _repair),
-    Operation("repair files", _damaged_files, _repair),
+    Operation("repair files", _damaged_files, _repair_and_resume),
     Operation("clean", _littered, _clean, exact=True),
     Operation("relabel", _relabelled, _relabel, places=("out",), fields=_KEPT_TO_RELABEL),
 )

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from uuid import uuid4
 
 import numpy as np
 
@@ -20,10 +18,11 @@ from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.record_files import SET_ASIDE
 from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import LedgerEntry
-from datagen.schemas.sealing import seal
+from datagen.schemas.sealing import CLAIM, SEALED, seal, store_record
+from datagen.schemas.sealing.contents import RECORD
 from datagen.schemas.storage import open_storage
-from tests.faults.crash_points_operations import small_schema
-from tests.made_runs import attempt, files_of, make_run, utc_now
+from tests.faults.crash_points_operations import remake, small_schema
+from tests.made_runs import files_of, make_run, utc_now
 
 # Records without a copy: a damaged one is set aside, or restored from what other records say.
 _ALONE = ("ledger/", "quarantine/")
@@ -82,39 +81,29 @@ def make_place(
     return run
 
 
-def remake(folder: Path) -> None:
-    """Make the missing shards, as `datagen resume` does, and seal."""
-    storage = open_storage(folder, probe=False, create=False)
-    for run in open_runs(storage):
-        for shard in run.missing():
-            assert attempt(run, shard, f"again-{shard}-{uuid4().hex[:8]}")
-    seal(storage)
-
-
 def content(folder: Path) -> dict[str, bytes]:
-    """Root records, the files of shards without the names of their attempts, and the sealed store."""
-    found: dict[str, bytes] = {}
-    for key, data in files_of(folder).items():
-        names = key.split("/")
-        if (
-            names[0] == SET_ASIDE
-            or {"ledger", "commits", "quarantine"} & set(names)
-            or "commit.json" in names
-        ):
-            continue
-        if "shards" in names:
-            del names[names.index("shards") + 2]
-        found["/".join(names)] = data
-    return found
+    """Root records, committed objects by shard, and the sealed store, whatever its name."""
+    root = open_storage(folder, probe=False)
+    found = {
+        key: data
+        for key, data in files_of(folder).items()
+        if not {*key.split("/")} & {SET_ASIDE, "ledger", "commits", "quarantine", "shards"}
+        and key[:4] != "data"
+    }
+    for run in open_runs(root):
+        found |= {f"{run.manifest.spec_hash} {one.shard}": run.read_object(one) for one in run.commits()}
+    store = store_record(root)
+    sealed = files_of(folder / store.name) if store else {}
+    return found | {f"sealed {path}": data for path, data in sealed.items()}
 
 
 def kind_of(key: str) -> str:
     """What sort of file a key names."""
     first, last = key.split("/")[0], key.rsplit("/", 1)[-1]
-    if first in ("shards", "data.zarr"):
-        sort = "commit copy" if last == "commit.json" else "zarr.json" if last == "zarr.json" else "chunk"
-        return f"sealed {sort}" if first == "data.zarr" else sort
-    return {"copies": "root copy"}.get(first, first.removesuffix(".json").rstrip("s"))
+    if first == SEALED:
+        return "sealed zarr.json" if last == "zarr.json" else "sealed file"
+    kinds = {"copies": "root copy", "shards": "object", RECORD: "store record"}
+    return kinds.get(first, first.removesuffix(".json").rstrip("s"))
 
 
 def flips(folder: Path, count: int, rng: np.random.Generator) -> Iterator[Damage]:
@@ -143,8 +132,8 @@ def cuts(folder: Path) -> Iterator[Damage]:
 
 
 def keys_of(folder: Path) -> list[str]:
-    """Every file below a folder."""
-    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+    """Every file below a folder that holds something: a claim is only a name."""
+    return sorted(key for key in files_of(folder) if not key.endswith(CLAIM))
 
 
 def try_all(
@@ -152,7 +141,7 @@ def try_all(
 ) -> None:
     """Do each damage to a run equal to `clean` and check it; repair every N-th of them, and check again."""
     shutil.rmtree(scratch, ignore_errors=True)
-    copy_run(clean, scratch)
+    shutil.copytree(clean, scratch)
     whole = files_of(clean)
     for number, damage in enumerate(damages):
         campaign.tried[damage.kind] += 1
@@ -165,11 +154,12 @@ def try_all(
             continue
         campaign.repaired[damage.kind] += 1
         repaired = repair_at(scratch)
-        if repaired.left:
+        is_lost = any(finding.kind == "lost" for finding in repaired.left)
+        if any(finding.kind != "lost" for finding in repaired.left):
             campaign.not_clean.append(f"{name}: {repaired.left[:2]}")
         there = files_of(scratch)
         apart = {key for key in whole.keys() | there.keys() if whole.get(key) != there.get(key)}
-        if repaired.set_aside:
+        if repaired.set_aside or repaired.resealed or is_lost:
             remake(scratch)
             if (left := content(scratch)) != content(clean):
                 campaign.not_restored.append(f"{name}: {sorted(left.items() ^ content(clean).items())[:1]}")
@@ -177,47 +167,21 @@ def try_all(
             campaign.not_restored.append(f"{name}: {sorted(apart)[:3]}")
         if left := findings_at(scratch):
             campaign.not_clean.append(f"{name}: {left[:2]}")
-        if apart:
+        if apart or is_lost:
             shutil.rmtree(scratch)
-            copy_run(clean, scratch)
-
-
-def copy_run(source: Path, target: Path) -> None:
-    """Copy a run with its hard links between data.zarr and the shards."""
-    linked: dict[int, Path] = {}
-    for path in sorted(source.rglob("*")):
-        to = target / path.relative_to(source)
-        if path.is_dir():
-            to.mkdir(parents=True, exist_ok=True)
-            continue
-        to.parent.mkdir(parents=True, exist_ok=True)
-        inode = path.stat().st_ino
-        if inode in linked:
-            os.link(linked[inode], to)
-        else:
-            shutil.copy2(path, to)
-            linked[inode] = to
+            shutil.copytree(clean, scratch)
 
 
 def apply(folder: Path, damage: Damage) -> Callable[[], None]:
-    """Change the file in place, so that its hard links change with it, or remove its name; what undoes it."""
-    path, held = folder / damage.key, folder.parent / "held"
+    """Change or remove the file; what undoes it."""
+    path = folder / damage.key
     before = path.read_bytes()
     data = damage.change(before)
     if data is None:
-        path.rename(held)
-        return lambda: held.rename(path) and None
-    _overwrite(path, data)
-    return lambda: _overwrite(path, before)
-
-
-def _overwrite(path: Path, data: bytes) -> None:
-    mode = path.stat().st_mode
-    path.chmod(0o644)
-    with path.open("r+b") as f:
-        f.truncate(0)
-        f.write(data)
-    path.chmod(mode)
+        path.unlink()
+    else:
+        path.write_bytes(data)
+    return lambda: path.write_bytes(before) and None
 
 
 def findings_at(folder: Path) -> list[Finding]:

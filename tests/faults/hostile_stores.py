@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
-import zlib
-from collections.abc import Callable
+import zipfile
+from collections.abc import Callable, Iterable
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,13 @@ import google_crc32c
 import numpy as np
 from numcodecs.zstd import Zstd
 
-from datagen.schemas.record_files import commit_copy_key, commit_key, signed_json
+from datagen.schemas.record_files import commit_key, signed_json
 from datagen.schemas.run import Run
+from datagen.schemas.sealing import store_record
+from datagen.schemas.shard_sources import ZipFiles
+from tests.made_runs import resign
 
-ATTEMPT = "shards/000001/a-1"
+OBJECT = "shards/a-1.zip"
 
 
 def replace_by(make: Callable[[Path, Path], None], key: str) -> Callable[[Path], None]:
@@ -58,42 +62,65 @@ def folder(path: Path, outside: Path) -> None:
     path.mkdir()
 
 
-def committed(key: str, data: Callable[[bytes], bytes]) -> Callable[[Path], None]:
-    """Other bytes in a file of shard 1, with commit, copy and signature that say that it is right."""
+def committed(path: str, data: Callable[[bytes], bytes]) -> Callable[[Path], None]:
+    """Other bytes for a file in the object of shard 1, with a commit that says that it is right."""
 
-    def change(run: Path) -> None:
-        path = run / ATTEMPT / key
-        path.chmod(0o644)
-        written = data(path.read_bytes())
-        path.write_bytes(written)
-        record = Run.open(run).commit_of(1).model_dump(mode="json")
-        for entry in record["files"]:
-            if entry["path"] == key:
-                entry["size"], entry["sha256"] = len(written), sha256(written).hexdigest()
-        sign(run, record)
+    def change(folder: Path) -> None:
+        run = Run.open(folder)
+        files = ZipFiles("object", run.read_object(run.commit_of(1)))
+        resign(run, "a-1", {path: data(files.get(path))})
 
     return change
 
 
-def sign(run: Path, record: dict[str, Any]) -> None:
-    for key in (commit_key(1), commit_copy_key(1, "a-1")):
-        (run / key).write_bytes(signed_json(record))
+def other_object(make: Callable[[bytes], bytes]) -> Callable[[Path], None]:
+    """Another object of shard 1, with a commit that says that it is right."""
+
+    def change(folder: Path) -> None:
+        data = make((folder / OBJECT).read_bytes())
+        (folder / OBJECT).write_bytes(data)
+        edited(lambda c: c["object"].update(size=len(data), sha256=sha256(data).hexdigest()))(folder)
+
+    return change
 
 
 def edited(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
-    """The commit of shard 1 and its copy, changed and signed anew."""
+    """The commit of shard 1, changed and signed anew."""
 
     def edit(run: Path) -> None:
         record = Run.open(run).commit_of(1).model_dump(mode="json")
         change(record)
-        sign(run, record)
+        (run / commit_key(1)).write_bytes(signed_json(record))
 
     return edit
 
 
-def file_at_the_root(run: Path) -> None:
-    secret = str(run.parent / "outside" / "secret")
-    edited(lambda commit: commit["files"][0].update(path=secret))(run)
+def zip_of(files: Iterable[tuple[str, bytes]], method: int = zipfile.ZIP_STORED) -> bytes:
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w", method) as archive:
+        for path, data in files:
+            archive.writestr(path, data)
+    return made.getvalue()
+
+
+def compressed(data: bytes) -> bytes:
+    """A deflated file of 1 GiB in the place of each array's metadata."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        names = archive.namelist()
+    return zip_of([("label/zarr.json", bytes(2**30)), *((n, b"") for n in names)], zipfile.ZIP_DEFLATED)
+
+
+def overlapping(data: bytes) -> bytes:
+    """Every entry of the directory has the size of 2^32 - 1 bytes."""
+    end = data.rindex(b"PK\5\6")
+    start = int.from_bytes(data[end + 16 : end + 20], "little")
+    directory = bytearray(data[start:end])
+    at = 0
+    while at < len(directory):
+        directory[at + 20 : at + 28] = b"\xfe\xff\xff\xff" * 2
+        lengths = [int.from_bytes(directory[at + k : at + k + 2], "little") for k in (28, 30, 32)]
+        at += 46 + sum(lengths)
+    return data[:start] + bytes(directory) + data[end:]
 
 
 def with_crc(packed: bytes) -> bytes:
@@ -148,50 +175,72 @@ def many_entries(run: Path) -> None:
 
 def odd_names(run: Path) -> None:
     for name in ("\x1b[2J\x1b]0;owned\x07", "line\nerror: fake", "\u202ereversed", "ünï", "a\\b", "%2e%2e"):
-        (run / ATTEMPT / name).write_bytes(b"")
+        (run / "shards" / name).write_bytes(b"")
         (run / "ledger" / f"{name}.json").write_bytes(b"{}")
 
 
 def deep_json(run: Path) -> None:
-    for key in ("commits/000001.json", f"{ATTEMPT}/commit.json", "ledger/a-1.json"):
+    for key in ("commits/000001.json", "ledger/a-1.start.json", "data.json"):
         (run / key).write_bytes(b'{"a":' * 500_000)
-    (run / "data.zarr/zarr.json").chmod(0o644)
     (run / "data.zarr/zarr.json").write_bytes(b"[" * 1_000_000)
 
 
 def signed_deep_json(run: Path) -> None:
     body = b'{\n "x": ' + b"[" * 200_000 + b"]" * 200_000
     data = body + b',\n "sha256": "' + sha256(body).hexdigest().encode() + b'"\n}\n'
-    for key in ("commits/000001.json", f"{ATTEMPT}/commit.json", "plans/1.json", "copies/plans/1.json"):
+    for key in ("commits/000001.json", "data.json", "plans/1.json", "copies/plans/1.json"):
         (run / key).write_bytes(data)
 
 
 def huge_json(run: Path) -> None:
-    for key in ("commits/000001.json", "ledger/a-1.json", "manifest.json"):
+    for key in ("commits/000001.json", "ledger/a-1.start.json", "manifest.json", "data.json"):
         with (run / key).open("r+b") as f:
             f.truncate(2**40)
 
 
-def huge_chunk(run: Path) -> None:
-    with (run / ATTEMPT / "rgb/c.0.0.0").open("r+b") as f:
+def huge_object(run: Path) -> None:
+    with (run / OBJECT).open("r+b") as f:
         f.truncate(2**40)
-
-    def claim(commit: dict[str, Any]) -> None:
-        next(e for e in commit["files"] if e["path"] == "rgb/c.0.0.0")["size"] = 2**40
-
-    edited(claim)(run)
+    edited(lambda commit: commit["object"].update(size=2**40))(run)
 
 
-def a_table_that_explodes(run: Path) -> None:
-    (run / "index").mkdir(exist_ok=True)
-    (run / "index/1.json.gz").write_bytes(zlib.compress(b"\0" * 2**28, wbits=31))
-    (run / "plans/1.json").write_bytes(b"")
+def edited_store(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
+    """The record of the sealed store, changed and signed anew."""
+
+    def edit(run: Path) -> None:
+        record = store_record(Run.open(run).storage)
+        assert record is not None
+        fields = record.model_dump(mode="json")
+        change(fields)
+        (run / "data.json").write_bytes(signed_json(fields))
+
+    return edit
+
+
+def sealed_index(index: bytes) -> Callable[[Path], None]:
+    """An index of the file of labels that names other ranges, with a checksum that fits."""
+
+    def change(run: Path) -> None:
+        path = run / "data.zarr/label/c.0"
+        size = (len(path.read_bytes()[:-4]) // 16) * 16
+        path.write_bytes(bytes(size) + with_crc((index * (size // len(index)))[:size]))
+        data = path.read_bytes()
+        entry = {"path": "label/c.0", "size": len(data), "sha256": sha256(data).hexdigest()}
+        edited_store(
+            lambda r: r.update(files=[entry if f["path"] == "label/c.0" else f for f in r["files"]])
+        )(run)
+
+    return change
+
+
+def a_store_of_links(run: Path) -> None:
+    """The record names a store that is a link, and files below and above it."""
+    (run / "data-2.zarr").symlink_to(run.parent / "outside")
+    edited_store(lambda record: record.update(name="data-2.zarr"))(run)
 
 
 HOSTILE: dict[str, Callable[[Path], None]] = {
-    "chunk linked outside": replace_by(link_to_file, f"{ATTEMPT}/label/c.0"),
-    "array linked outside": replace_by(link_to_folder, f"{ATTEMPT}/label"),
-    "attempt linked outside": replace_by(link_to_folder, ATTEMPT),
+    "object linked outside": replace_by(link_to_file, OBJECT),
     "shards linked outside": replace_by(link_to_folder, "shards"),
     "commits linked outside": replace_by(link_to_folder, "commits"),
     "ledger linked outside": replace_by(link_to_folder, "ledger"),
@@ -199,14 +248,17 @@ HOSTILE: dict[str, Callable[[Path], None]] = {
     "plans linked outside": replace_by(link_to_folder, "plans"),
     "sealed store linked outside": replace_by(link_to_folder, "data.zarr"),
     "sealed root linked outside": replace_by(link_to_file, "data.zarr/zarr.json"),
-    "pipe for a chunk": replace_by(pipe, f"{ATTEMPT}/label/c.0"),
+    "store record linked outside": replace_by(link_to_file, "data.json"),
+    "a store of links": a_store_of_links,
+    "pipe for an object": replace_by(pipe, OBJECT),
     "pipe for a manifest": replace_by(pipe, "manifest.json"),
     "pipe for a commit": replace_by(pipe, commit_key(1)),
-    "pipe for an account": replace_by(pipe, "ledger/a-1.json"),
-    "pipe for a sealed chunk": replace_by(pipe, "data.zarr/label/c.1"),
-    "device for a chunk": replace_by(device, f"{ATTEMPT}/points_m/c.0.0.0"),
+    "pipe for a start": replace_by(pipe, "ledger/a-1.start.json"),
+    "pipe for a sealed file": replace_by(pipe, "data.zarr/label/c.0"),
+    "pipe for a store record": replace_by(pipe, "data.json"),
+    "device for an object": replace_by(device, OBJECT),
     "device for a commit": replace_by(device, commit_key(1)),
-    "folder for a chunk": replace_by(folder, f"{ATTEMPT}/label/c.0"),
+    "folder for an object": replace_by(folder, OBJECT),
     "folder for a commit": replace_by(folder, commit_key(1)),
     "frame of terabytes": committed("points_m/c.0.0.0", declares_terabytes),
     "frame that explodes": committed("points_m/c.0.0.0", explodes),
@@ -221,17 +273,25 @@ HOSTILE: dict[str, Callable[[Path], None]] = {
     "pickles": committed("label/zarr.json", metadata(lambda m: m["codecs"].insert(0, {"name": "pickle"}))),
     "other codecs": committed("label/zarr.json", metadata(lambda m: m.update(codecs=[{"name": "gzip"}]))),
     "deep metadata": committed("label/zarr.json", lambda data: b"[" * 200_000),
-    "file outside": edited(lambda c: c["files"][0].update(path="../../../../outside/secret")),
-    "file at the root": file_at_the_root,
+    "object outside": edited(lambda c: c["object"].update(path="../../../../outside/secret")),
+    "object at the root": lambda run: edited(
+        lambda c: c["object"].update(path=str(run.parent / "outside" / "secret"))
+    )(run),
     "attempt outside": edited(lambda c: c.update(attempt="../../../outside")),
-    "20,000 files": edited(
-        lambda c: c.update(files=[{"path": f"x/{i}", "size": 0, "sha256": "0" * 64} for i in range(20_000)])
-    ),
-    "huge chunk": huge_chunk,
+    "20,000 files": other_object(lambda data: zip_of((f"x/{i}", b"") for i in range(20_000))),
+    "files outside": other_object(lambda data: zip_of([("../../outside/secret", b"x"), ("/etc/x", b"x")])),
+    "compressed files": other_object(compressed),
+    "files that overlap": other_object(overlapping),
+    "no zip": other_object(lambda data: b"PK" * 10_000),
+    "huge object": huge_object,
+    "store outside": edited_store(lambda r: r.update(name="../outside")),
+    "sealed file outside": edited_store(lambda r: r["files"][0].update(path="../../outside/secret")),
+    "huge sealed file": edited_store(lambda r: r["files"][0].update(size=2**40)),
+    "sealed index beyond its file": sealed_index((2**49).to_bytes(8, "little") * 2),
+    "sealed index of nothing": sealed_index(b"\0" * 16),
     "deep JSON": deep_json,
     "deep JSON, signed": signed_deep_json,
     "huge JSON": huge_json,
-    "table that explodes": a_table_that_explodes,
     "20,000 entries": many_entries,
     "odd names": odd_names,
 }

@@ -59,7 +59,7 @@ def _apart(folder: Path) -> None:
 
 def _damaged(folder: Path) -> None:
     seal(make_run(folder, 30).storage)
-    for key in ("commits/000001.json", "copies/manifest.json", "shards/000002/a-2/label/c.0"):
+    for key in ("copies/manifest.json", "ledger/a-1.start.json", "data.zarr/label/c.0"):
         (folder / key).unlink()
 
 

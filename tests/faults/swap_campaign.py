@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from datagen.schemas.record_files import MERGED, encode_record, part_folder, publish
-from datagen.schemas.run_records import LedgerEntry, Merged, QuarantineRecord
+from datagen.schemas.merging import merge_runs, plan_merge
+from datagen.schemas.run_records import LedgerEntry, QuarantineRecord
 from datagen.schemas.sealing import SEALED, seal
+from datagen.schemas.sealing.contents import RECORD
 from datagen.schemas.storage import open_storage
-from tests.faults.damage_campaign import content, copy_run, findings_at, remake, repair_at
+from tests.faults.crash_points_operations import remake
+from tests.faults.damage_campaign import content, findings_at, repair_at
 from tests.made_runs import attempt, files_of, make_run, small_spec, utc_now
 
 PLACES = ("run", "open", "merged")
@@ -51,12 +53,11 @@ def make_world(world: Path) -> None:
     _run(world / "run", 29, 0, "r")
     seal(open_storage(world / "run"))
     _run(world / "open", 20, 1, "o")
-    specs = sorted((small_spec(seed) for seed in (2, 3)), key=lambda spec: spec.hash())
-    for k, spec in enumerate(specs):
-        _run(world / "merged" / part_folder(spec.hash()), 10 + 20 * k, spec.seed, f"m{k}")
-    place = open_storage(world / "merged")
-    publish(place, MERGED, encode_record(Merged(parts=tuple(spec.hash() for spec in specs))))
-    seal(place)
+    for k, seed in enumerate((2, 3)):
+        _run(world / f"part-{k}", 10 + 20 * k, seed, f"m{k}")
+    merge_runs(plan_merge([str(world / "part-0"), str(world / "part-1")], str(world / "merged")))
+    for k in range(2):
+        shutil.rmtree(world / f"part-{k}")
 
 
 def _run(folder: Path, n: int, seed: int, name: str) -> None:
@@ -87,9 +88,11 @@ def kind_of(path: str) -> str:
     """The sort of a file among which it is swapped; "" for one that is swapped with none."""
     names = path.split("/")[3 if path.startswith("merged/parts/") else 1 :]
     if names[0] == SEALED:
-        return "" if names[-1] == "zarr.json" else f"sealed {names[1]}"
+        return "" if names[-1] == "zarr.json" else "sealed file"
+    if names[0].startswith("data"):
+        return "store record" if names[0] == RECORD else ""
     if names[0] == "shards":
-        return "commit copy" if names[-1] == "commit.json" else "" if len(names) < 5 else f"chunk {names[3]}"
+        return "object"
     if names[0] == "ledger":
         return "start" if names[-1].endswith(".start.json") else "end"
     sort = names[-1] if "manifest.json" in names else names[-2] if len(names) > 1 else ""
@@ -97,30 +100,22 @@ def kind_of(path: str) -> str:
 
 
 def swaps(world: Path, each: int | None, rng: np.random.Generator) -> Iterator[Swap]:
-    """Pairs of files of one sort and, of chunks, of one size, that differ: all, or N of each sort."""
+    """Pairs of files of one sort that differ: all, or N of each sort."""
     files = files_of(world)
-    by_kind: dict[tuple[str, int], list[str]] = {}
-    for path, data in files.items():
-        if (kind := kind_of(path)) and "zarr.json" not in path:
-            is_chunk = kind.startswith(("chunk", "sealed"))
-            by_kind.setdefault((kind, len(data) if is_chunk else 0), []).append(path)
-    pairs: dict[str, list[Swap]] = {}
-    for (kind, _), paths in sorted(by_kind.items()):
-        found = [Swap(kind, a, b) for a, b in combinations(paths, 2) if files[a] != files[b]]
-        pairs.setdefault(kind.split(" ")[0] if kind.startswith(("chunk", "sealed")) else kind, []).extend(
-            found
-        )
-    for kind in sorted(pairs):
-        chosen = pairs[kind]
-        if each is not None and len(chosen) > each:
-            chosen = [chosen[k] for k in sorted(rng.choice(len(chosen), each, replace=False))]
-        yield from (Swap(kind, swap.one, swap.other) for swap in chosen)
+    by_kind: dict[str, list[str]] = {}
+    for path in files:
+        if kind := kind_of(path):
+            by_kind.setdefault(kind, []).append(path)
+    for kind, paths in sorted(by_kind.items()):
+        pairs = [Swap(kind, a, b) for a, b in combinations(paths, 2) if files[a] != files[b]]
+        few = each is not None and len(pairs) > each
+        yield from (pairs[k] for k in sorted(rng.choice(len(pairs), each, replace=False))) if few else pairs
 
 
 def try_swap(clean: Path, world: Path, swap: Swap, found: Swaps) -> None:
     """Exchange two files, check the places that hold them, fix these, and compare everything."""
     shutil.rmtree(world, ignore_errors=True)
-    copy_run(clean, world)
+    shutil.copytree(clean, world)
     before = files_of(world)
     exchange(world / swap.one, world / swap.other)
     found.tried[swap.kind] += 1
@@ -133,11 +128,16 @@ def try_swap(clean: Path, world: Path, swap: Swap, found: Swaps) -> None:
             wrong(f"{place}: missed")
     # All are swapped before one is repaired: a file in another place counts as lost where it belongs.
     repaired = {place: repair_at(world / place) for place in swap.places}
-    left = [finding for each in repaired.values() for finding in each.left if finding.is_damage]
+    left = [
+        finding
+        for each in repaired.values()
+        for finding in each.left
+        if finding.is_damage and finding.kind != "lost"  # until it is resumed
+    ]
     # The ends of attempts whose shards are set aside become superseded.
     there = set(files_of(world).values())
     lost = {path for path, data in before.items() if data not in there}
-    if lost := {path for path in lost if "/ledger/" not in path and SEALED not in path}:
+    if lost := {path for path in lost if "/ledger/" not in path and "/data." not in path}:
         wrong(f"{sorted(lost)[:3]} are nowhere any more")
     for place in swap.places:
         if not left and (repaired[place].set_aside or repaired[place].resealed):
@@ -148,22 +148,16 @@ def try_swap(clean: Path, world: Path, swap: Swap, found: Swaps) -> None:
         f"{place}/{key}"
         for place in swap.places
         for key, _ in content(world / place).items() ^ content(clean / place).items()
-        if place != "open" or not key.startswith(SEALED)  # a repair seals it
+        if place != "open" or not key.startswith("sealed ")  # a repair seals it
     }
     if apart - {swap.one, swap.other} or (apart and not left):
         wrong(f"others differ: {sorted(apart)[:3]}")
-    kind = (
-        found.left
-        if left
-        else found.set_aside
-        if any(r.set_aside for r in repaired.values())
-        else found.restored
-    )
-    kind[swap.kind] += 1
+    is_aside = any(each.set_aside for each in repaired.values())
+    (found.left if left else found.set_aside if is_aside else found.restored)[swap.kind] += 1
 
 
 def exchange(one: Path, other: Path) -> None:
-    """Let two files exchange their names; other links to them stay."""
+    """Let two files exchange their names."""
     held = one.with_name("held")
     one.rename(held)
     other.rename(one)

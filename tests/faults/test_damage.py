@@ -63,6 +63,6 @@ def test_every_cut_is_found_and_repaired(clean: Path, tmp_path: Path):
 def test_the_campaign_sees_what_is_missed(clean: Path, tmp_path: Path):
     """A damage that changes nothing must be told as missed, or the campaign proves nothing."""
     campaign = Campaign()
-    nothing = Damage("flip chunk", keys_of(clean)[0], lambda data: data)
+    nothing = Damage("flip object", keys_of(clean)[0], lambda data: data)
     try_all(clean, tmp_path / "run", [nothing], campaign)
     assert len(campaign.missed) == 1

@@ -23,7 +23,7 @@ def test_a_job_on_a_failing_store_is_resumed_until_it_is_done(
         hold=0.003,
         hold_s=3.0,
         seed=4,
-        down_after=[300],
+        down_after=[80],
         down_at_commits=[0],
         down_for_s=3.5,
     )

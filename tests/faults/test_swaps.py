@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,11 +11,12 @@ import pytest
 
 from datagen import cli
 from datagen.schemas.errors import InputError
-from datagen.schemas.record_files import commit_copy_key, commit_key, encode_record
+from datagen.schemas.record_files import commit_key
 from datagen.schemas.run import Run, open_runs
-from tests.faults.damage_campaign import copy_run, fewer_arrays, findings_at, repair_at
+from tests.faults.crash_points_operations import remake
+from tests.faults.damage_campaign import content, fewer_arrays, findings_at, repair_at
 from tests.faults.swap_campaign import Swap, Swaps, exchange, make_world, swaps, try_swap
-from tests.made_runs import attempt, files_of, make_run, small_spec, write
+from tests.made_runs import attempt, files_of, make_run, small_spec
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -37,8 +39,8 @@ def test_a_swap_of_each_kind_is_found_and_repaired_or_left_whole(clean: Path, tm
     for swap in swaps(clean, 1, np.random.default_rng(3)):
         try_swap(clean, tmp_path / "world", swap, found)
     assert found.wrong == []
-    assert {"manifest.json", "plans", "commits", "commit copy", "copy of plans"} <= found.restored.keys()
-    assert found.left.keys() == {"start", "end"} and "quarantine" in found.set_aside and len(found.tried) > 10
+    assert {"manifest.json", "plans", "copy of plans", "sealed file"} <= found.restored.keys()
+    assert found.left.keys() == {"end"} and {"commits", "object", "quarantine"} <= found.set_aside.keys()
 
 
 def test_the_campaign_sees_what_is_missed(clean: Path, tmp_path: Path) -> None:
@@ -51,12 +53,11 @@ def test_the_campaign_sees_what_is_missed(clean: Path, tmp_path: Path) -> None:
 def test_merged_runs_are_not_sealed_over_exchanged_plans(
     folders: tuple[str, ...], clean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    copy_run(clean / "merged", tmp_path / "merged")
+    shutil.copytree(clean / "merged", tmp_path / "merged")
     one, other = (Path(run.storage.url) for run in open_runs(tmp_path / "merged"))
     whole = files_of(tmp_path / "merged")
     for folder in folders:
-        for number in (1, 2):
-            exchange(one / f"{folder}/{number}.json", other / f"{folder}/{number}.json")
+        exchange(one / f"{folder}/1.json", other / f"{folder}/1.json")
     before = files_of(tmp_path / "merged")
     has_copies = len(folders) == 1
     with pytest.raises(InputError, match=r"spec_hash.*datagen verify --repair"):
@@ -68,7 +69,7 @@ def test_merged_runs_are_not_sealed_over_exchanged_plans(
 
 
 def test_a_manifest_of_another_part_is_not_read(clean: Path, tmp_path: Path) -> None:
-    copy_run(clean / "merged", tmp_path / "merged")
+    shutil.copytree(clean / "merged", tmp_path / "merged")
     whole = files_of(tmp_path / "merged")
     one, other = (Path(run.storage.url) for run in open_runs(tmp_path / "merged"))
     exchange(one / "manifest.json", other / "manifest.json")
@@ -78,19 +79,19 @@ def test_a_manifest_of_another_part_is_not_read(clean: Path, tmp_path: Path) -> 
     assert files_of(tmp_path / "merged") == whole
 
 
-def test_a_commit_that_the_ledger_does_not_know_gives_way_to_the_winners(tmp_path: Path) -> None:
-    """One of another run of the specification, and one of an attempt that lost and was killed."""
+def test_commits_of_two_runs_of_one_specification_are_told_apart(tmp_path: Path) -> None:
     for name in ("run", "twin"):
         run = make_run(tmp_path / name, 20, shards=[], spec=small_spec(4))
         for shard in run.missing():
             assert attempt(run, shard, f"{name}-{shard}")
-    run = Run.open(tmp_path / "run")
-    run.storage.put(commit_copy_key(1, "loser"), encode_record(write(run, 1, "loser")))
-    whole = files_of(tmp_path)
+    whole = content(tmp_path / "run")
     exchange(tmp_path / "run" / commit_key(0), tmp_path / "twin" / commit_key(0))
-    exchange(tmp_path / "run" / commit_key(1), tmp_path / "run" / commit_copy_key(1, "loser"))
     for name in ("run", "twin"):
-        assert {finding.key for finding in findings_at(tmp_path / name)} >= {commit_key(0)}
-        assert repair_at(tmp_path / name).left == []
-    after = files_of(tmp_path)
-    assert {key for key in whole if after.get(key) != whole[key]} == {f"run/{commit_copy_key(1, 'loser')}"}
+        folder = tmp_path / name
+        assert {finding.shard for finding in findings_at(folder)} == {0}
+        assert repair_at(folder).left == []
+        remake(folder)
+        assert findings_at(folder) == []
+        assert {key: content(folder)[key] for key in whole if "json" not in key} == {
+            key: data for key, data in whole.items() if "json" not in key
+        }

@@ -18,7 +18,7 @@ from datagen.schemas.checking.finding import Finding, Reseal, Restore, SetAside,
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import SET_ASIDE, commit_key, object_key
 from datagen.schemas.run import Run, label_counts, open_runs
-from datagen.schemas.run_records import Commit, LedgerEntry, ShardRanges, foreign_field
+from datagen.schemas.run_records import MAX_FILE_BYTES, Commit, LedgerEntry, ShardRanges, foreign_field
 from datagen.schemas.sealing import CLAIM, remove_store, seal, store_record
 from datagen.schemas.sealing.contents import RECORD, SEALED
 from datagen.schemas.storage import Storage
@@ -26,8 +26,7 @@ from datagen.schemas.storage import Storage
 # Restoring a record reveals what depends on it: commits, then shards, then the sealed store.
 _PASSES = 6
 # Kinds of findings that do not keep a run from being sealed.
-_HARMLESS = ("account", "sealed", "stale", "lost")
-_MOST_BYTES = 2**31  # of a file that is set aside
+_HARMLESS = ("account", "sealed", "stale")
 _CAUSE = "its shard was set aside by datagen verify --repair"
 
 Seen = Callable[[int, int], None]
@@ -129,7 +128,7 @@ def _set_aside(storage: Storage, key: str, finding: Finding, into: str) -> None:
 def _move(storage: Storage, keys: Iterable[str], into: str) -> None:
     """Move files into a folder: each exists there, durably, before it is removed."""
     for key in keys:
-        data = storage.get(key, _MOST_BYTES)
+        data = storage.get(key, MAX_FILE_BYTES)
         if data is not None:
             storage.put_new(f"{into}/{key}", data)
             storage.delete([key])
