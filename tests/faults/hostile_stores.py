@@ -217,22 +217,6 @@ def edited_store(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], N
     return edit
 
 
-def sealed_index(index: bytes) -> Callable[[Path], None]:
-    """An index of the file of labels that names other ranges, with a checksum that fits."""
-
-    def change(run: Path) -> None:
-        path = run / "data.zarr/label/c.0"
-        size = (len(path.read_bytes()[:-4]) // 16) * 16
-        path.write_bytes(bytes(size) + with_crc((index * (size // len(index)))[:size]))
-        data = path.read_bytes()
-        entry = {"path": "label/c.0", "size": len(data), "sha256": sha256(data).hexdigest()}
-        edited_store(
-            lambda r: r.update(files=[entry if f["path"] == "label/c.0" else f for f in r["files"]])
-        )(run)
-
-    return change
-
-
 def a_store_of_links(run: Path) -> None:
     """The record names a store that is a link, and files below and above it."""
     (run / "data-2.zarr").symlink_to(run.parent / "outside")
@@ -287,8 +271,6 @@ HOSTILE: dict[str, Callable[[Path], None]] = {
     "store outside": edited_store(lambda r: r.update(name="../outside")),
     "sealed file outside": edited_store(lambda r: r["files"][0].update(path="../../outside/secret")),
     "huge sealed file": edited_store(lambda r: r["files"][0].update(size=2**40)),
-    "sealed index beyond its file": sealed_index((2**49).to_bytes(8, "little") * 2),
-    "sealed index of nothing": sealed_index(b"\0" * 16),
     "deep JSON": deep_json,
     "deep JSON, signed": signed_deep_json,
     "huge JSON": huge_json,
