@@ -13,7 +13,16 @@ from datagen.schemas.identity import sample_ids
 from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.record_files import commit_key, encode_record, object_key, utc_now
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Commit, Cost, FileEntry, Host, Layout, LedgerEntry, Manifest
+from datagen.schemas.run_records import (
+    Commit,
+    Cost,
+    FileEntry,
+    Host,
+    Layout,
+    LedgerEntry,
+    Manifest,
+    QuarantineRecord,
+)
 from datagen.schemas.shard_files import encode_shard, zipped
 from datagen.schemas.shard_sources import ZipFiles
 from datagen.schemas.specification import ObservationParams, SceneParams, Source, Specification
