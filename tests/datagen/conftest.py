@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 
 from datagen import cli
-from tests.faults.damage_campaign import copy_run
 from tests.small_runs import CONFIG, PER_SCENE, make_small_run
 
 # Long arms, so that some candidates can be reached; few grasps, which are quickly found.
@@ -42,7 +42,7 @@ def paired(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture
 def copied(finished: Path, tmp_path: Path) -> Path:
     """The finished run, or the one of that name in the test's file, to be changed; its links are kept."""
-    copy_run(finished, tmp_path / "run")
+    shutil.copytree(finished, tmp_path / "run")
     return tmp_path / "run"
 
 

@@ -16,8 +16,8 @@ from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage
 from datagen.train.dataset import SampleStream
 from datagen.train.reader import SampleReader
-from tests.faults.s3_campaign import sealed_arrays
 from tests.refusals import refused
+from tests.schemas.checked import stored
 from tests.small_runs import CONFIG, PER_SCENE, arrays_of, assert_equal_runs, json_of, make_small_run
 
 
@@ -42,7 +42,7 @@ def test_a_run_on_s3_is_the_run_on_a_disk(
     submit(out, 16, *config)
     local = arrays_of(make_small_run(tmp_path / "local", 16))
     run = Run.open(out)
-    assert_equal_runs(sealed_arrays(run), local)
+    assert_equal_runs(stored(run.storage), local)
 
     state = json_of(capsys, ["status", out])
     assert (state["run"], state["labels"], state["complete"], state["sealed"]) == (out, 16, True, True)
@@ -51,7 +51,7 @@ def test_a_run_on_s3_is_the_run_on_a_disk(
     assert (tmp_path / "scene.png").stat().st_size > 10_000
     again = f"{bucket}/runs/again"
     submit(again, 8, "--scenes-from", out)
-    assert sealed_arrays(Run.open(again))["scene_index"].tolist() == [0]
+    assert stored(Run.open(again).storage)["scene_index"].tolist() == [0]
     arguments = ["submit", "heuristic", "--n", "32", "--out", f"{bucket}/more", "--scenes-from", out]
     refused([*arguments, "--workers", "0"], capsys, "--n: 32", f"is more than the 16 candidates of {out}")
 
@@ -65,7 +65,7 @@ def test_worker_processes_write_to_s3_and_a_reader_reads_it(
     told = capsys.readouterr()
     assert '"shards_done": 2' in told.out + told.err
     local = make_small_run(tmp_path / "local", 16)
-    assert_equal_runs(sealed_arrays(Run.open(out)), arrays_of(local))
+    assert_equal_runs(stored(Run.open(out).storage), arrays_of(local))
     whole = list(SampleReader([local]).shards())
     for place in (out, f"{out}/data.zarr"):
         for ours, theirs in zip(SampleReader([place]).shards(), whole, strict=True):
