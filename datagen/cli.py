@@ -25,6 +25,8 @@ from cyclopts.exceptions import (
 from datagen import __version__
 from datagen.cluster.environment import job_environment
 from datagen.console.command_lines import PRINTER, Interrupted, begin_with_process
+from datagen.console.printing import drop_output
+from datagen.display.observers import LossyStream
 from datagen.schemas.errors import InputError, one_line, refuse_not_utf8
 from datagen.workers.extras import missing_library
 from datagen.workers.registry import allow
@@ -184,8 +186,7 @@ def run(arguments: Sequence[str]) -> int:
         # The reader closed the pipe (`datagen status | head`); rich raises SystemExit for it.
         if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
             raise
-        # Without this, Python reports a second error when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        drop_output()
         return EXIT_CLOSED_PIPE
     except Exception as error:
         lines = _lines_for(error, verb)
@@ -216,6 +217,7 @@ def main() -> None:
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:  # closed by the shell (`>&-`): no other file may get its descriptor
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
+    sys.stderr = LossyStream(sys.stderr)
     begin_with_process()
     with job_environment():
         code = run(sys.argv[1:])

@@ -100,7 +100,6 @@ def score(
         runs: Folder with the runs of `datagen benchmark make`; those that it lacks are not scored.
         fit: Run in validation houses to fit baselines on; repeat for more.
         out: File to write, .json or .html; repeat for both.
-        json: Print one JSON document, and progress as JSON lines.
     """
     from datagen.evaluation.benchmark import (
         present_runs,

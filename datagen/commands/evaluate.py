@@ -60,7 +60,6 @@ def evaluate(
         workers: Processes of the closed loop; 0: this process, for debuggers. [default: cores]
         allow_seen_houses: Report training houses separately instead of failing.
         out: File to write, .json or .html; repeat for both.
-        json: Print one JSON document, and progress as JSON lines.
 
     Returns:
         All numbers, as `datagen evaluate --json` prints them (docs/guides/evaluate.md).

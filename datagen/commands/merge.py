@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from datagen.console.command_lines import absolute_path, command_line, prints, resumable, words_of
 from datagen.console.options import AsJson, PathOrAddress
-from datagen.console.printing import print_json, print_rows, seconds
+from datagen.console.printing import print_json, print_rows, seconds, summary_of_stored
 from datagen.display.progress import steps
 from datagen.reports.spending import account_for
 from datagen.schemas.merging import MergePlan, MergeResult, WrittenPart, merge_runs, plan_merge
@@ -25,9 +25,15 @@ _WORDS = {
 
 def print_merged(report: dict[str, Any], json: bool, **_: Any) -> int:
     """Print the report of a merge."""
-    if json:
-        print_json(report)
-        return 0
+    with summary_of_stored():
+        if json:
+            print_json(report)
+        else:
+            _print_rows(report)
+    return 0
+
+
+def _print_rows(report: dict[str, Any]) -> None:
     missing = sum(part["missing_shards"] for part in report["runs"])
     state = f"; missing shards: {missing}" if missing else ""
     out = report["out"]
@@ -52,7 +58,6 @@ def print_merged(report: dict[str, Any], json: bool, **_: Any) -> int:
                 ("shards", ", ".join(counts) or "none"),
             ],
         )
-    return 0
 
 
 @prints(print_merged)
@@ -74,7 +79,6 @@ def merge(
     Args:
         runs: Runs, or merged runs, to merge.
         out: Folder or s3:// address of the result, which may exist.
-        json: Report progress as JSON lines.
 
     Returns:
         Labels, shards, cost and origin of each part, as `datagen merge --json` prints them.

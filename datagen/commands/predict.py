@@ -101,7 +101,6 @@ class PredictOptions:
         arrival: Arrival error to choose for: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv.
         out: Picture to write, FILE.png.
         html: Page to write, FILE.html.
-        json: For the command line only.
     """
 
     checkpoint: Annotated[Checkpoint | None, Parameter(name="CHECKPOINT")] = None

@@ -10,7 +10,7 @@ from typing import Literal
 
 from datagen.console.command_lines import command_line, print_interrupted
 from datagen.console.options import AsJson, RunPath
-from datagen.console.printing import counted, print_json, print_rows, seconds
+from datagen.console.printing import counted, print_json, print_rows, seconds, summary_of_stored
 from datagen.relabelling import Relabelled, relabel_run, relabelled_specification
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
@@ -88,19 +88,20 @@ def _report(run: str, out: str, storage: Storage, done: Relabelled, elapsed_s: f
         "shards_to_come": done.absent,
         "seconds": round(elapsed_s, 3),
     }
-    if json:
-        print_json(report)
-    else:
-        rows = [
-            ("labels", f"{labels:,} new of {report['wanted']:,} wanted" if labels else "nothing to do"),
-            ("positive", f"{100 * positives / labels:.1f}%" if labels else "-"),
-            ("changed", f"{done.flips.to_good:,} labels became positive, {done.flips.to_bad:,} negative"),
-            ("time", seconds(elapsed_s)),
-        ]
-        if done.absent:
-            absent = counted(done.absent, "shard")
-            rows.append(("to come", f"{absent} that {run} lacks: make them, then relabel again"))
-        print_rows(f"{summary.end}: {out}", rows)
+    with summary_of_stored():
+        if json:
+            print_json(report)
+        else:
+            rows = [
+                ("labels", f"{labels:,} new of {report['wanted']:,} wanted" if labels else "nothing to do"),
+                ("positive", f"{100 * positives / labels:.1f}%" if labels else "-"),
+                ("changed", f"{done.flips.to_good:,} labels became positive, {done.flips.to_bad:,} negative"),
+                ("time", seconds(elapsed_s)),
+            ]
+            if done.absent:
+                absent = counted(done.absent, "shard")
+                rows.append(("to come", f"{absent} that {run} lacks: make them, then relabel again"))
+            print_rows(f"{summary.end}: {out}", rows)
     if summary.end == "aborted":
         raise InputError(
             out, "", f"cannot continue: {summary.cause}", f"Then run again: {command_line(sys.argv[1:])}"

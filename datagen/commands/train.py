@@ -15,7 +15,7 @@ from cyclopts import Parameter
 from datagen.configuration.toml_files import read_toml
 from datagen.console.command_lines import Interrupted, interruptible, options_of, print_interrupted, prints
 from datagen.console.options import AllowIncomplete, AsJson, File, PathOrAddress, PathsOrAddresses, Whole
-from datagen.console.printing import print_json, print_rows, seconds
+from datagen.console.printing import print_json, print_rows, seconds, summary_of_stored
 from datagen.released import checkpoint_file
 from datagen.schemas.errors import InputError, choices
 
@@ -33,22 +33,23 @@ def print_training(head: CheckpointHead | None, out: str | Path, json: bool, **_
     """Print the content of a checkpoint; `head` is None where training was interrupted before it had one."""
     finished = head is not None and head.finished
     best = head.history[head.best_epoch - 1] if head and head.best_epoch else None
-    if json:
-        print_json(
-            {
-                "out": str(out),
-                "end": "finished" if finished else "interrupted",
-                "digest": head.digest if head else None,
-                "model": head.model if head else None,
-                "epochs": head.epoch if head else 0,
-                "steps": head.step if head else 0,
-                "best": best,
-                "history": head.history if head else (),
-                "cost": head.cost if head else {},
-            }
-        )
-    elif head is not None:
-        print_rows(f"{'finished' if finished else 'interrupted'}: {out}", list(_rows(head, best)))
+    with summary_of_stored():
+        if json:
+            print_json(
+                {
+                    "out": str(out),
+                    "end": "finished" if finished else "interrupted",
+                    "digest": head.digest if head else None,
+                    "model": head.model if head else None,
+                    "epochs": head.epoch if head else 0,
+                    "steps": head.step if head else 0,
+                    "best": best,
+                    "history": head.history if head else (),
+                    "cost": head.cost if head else {},
+                }
+            )
+        elif head is not None:
+            print_rows(f"{'finished' if finished else 'interrupted'}: {out}", list(_rows(head, best)))
     if finished:
         return 0
     print_interrupted("; nothing is lost", sys.argv[1:])
@@ -96,7 +97,6 @@ class TrainOptions:
         device: Device of the model.
         threads: Threads. [default: all cores]
         allow_incomplete: Accept runs that lack planned samples instead of failing.
-        json: Report progress as JSON lines.
     """
 
     stage: Annotated[Literal["stage1", "stage2", "sim-only"], Parameter(name="STAGE")]

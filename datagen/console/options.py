@@ -48,7 +48,8 @@ PathOrAddress = Annotated[str | Path, Parameter(metavar="STR")]
 PathsOrAddresses = Annotated[Sequence[str | Path], Parameter(metavar="STR...")]
 File = Annotated[str | Path, Parameter(metavar="PATH")]
 AllowIncomplete = Annotated[bool, Parameter(help="Accept runs that lack planned samples instead of failing.")]
-AsJson = Annotated[bool, Parameter(help="Print one JSON document to standard output.")]
+JSON_HELP = "Print one JSON document to standard output, and progress as JSON lines to standard error."
+AsJson = Annotated[bool, Parameter(help=JSON_HELP)]
 
 
 def refuse_output(file: Path, option: str, *endings: str) -> None:

@@ -6,8 +6,10 @@ Records of a run may come from another user, so control characters are escaped, 
 from __future__ import annotations
 
 import json
+import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from typing import Any, TextIO
 
 from rich.console import Console
@@ -46,6 +48,23 @@ def print_lines(text: str, indent: str = "") -> None:
     """Print the lines of a text."""
     sys.stdout.writelines(f"{indent}{printable(line)}\n" for line in text.splitlines())
     sys.stdout.flush()
+
+
+def drop_output() -> None:
+    """Send further standard output nowhere. Without this, Python reports a second error when it exits."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextmanager
+def summary_of_stored() -> Generator[None]:
+    """Drop a summary that cannot be printed: the result that it is about is stored."""
+    try:
+        yield
+        sys.stdout.flush()
+    except (OSError, SystemExit) as error:  # rich raises SystemExit for a closed pipe
+        if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
+            raise
+        drop_output()
 
 
 def counted(n: int, what: str) -> str:

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
+from typing import TextIO, cast
 
 from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn
@@ -20,6 +21,7 @@ from rich.progress import Progress as Bar
 from rich.table import Column
 from rich.text import Text
 
+from datagen.display.observers import LossyStream
 from datagen.schemas.errors import printable
 
 _RATE_OVER_S, _LINE_EVERY_S, _DRAW_EVERY_S = 60.0, 10.0, 0.2
@@ -68,7 +70,9 @@ class Progress:
         self, as_json: bool = False, clock: Clock = time.monotonic, console: Console | None = None
     ) -> None:
         self._json, self.clock = as_json, clock
-        self._console = console or Console(stderr=True, force_terminal=sys.stderr.isatty())
+        self._console = console or Console(
+            file=cast(TextIO, LossyStream(sys.stderr, waits=False)), force_terminal=sys.stderr.isatty()
+        )
         # A notebook shows a bar through ipywidgets; without them it gets lines of text.
         notebook = self._console.is_jupyter and find_spec("ipywidgets") is not None
         self._live = (self._console.is_interactive or notebook) and not as_json

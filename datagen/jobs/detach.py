@@ -18,7 +18,6 @@ from datagen.cluster.job_monitor import JOBS_API, SUBMISSION
 from datagen.cluster.ray_head import ensure_head
 from datagen.cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
 from datagen.console.command_lines import command_line
-from datagen.console.printing import print_rows
 from datagen.jobs.job import JobOptions
 from datagen.jobs.job_report import JobResult
 from datagen.schemas.errors import InputError
@@ -31,7 +30,7 @@ Options = TypeVar("Options", bound=JobOptions)
 
 
 def detach_job(words: Sequence[str], path: str, job_options: JobOptions) -> JobResult:
-    """Run the command of these words as a Ray job, and print how to follow it.
+    """Run the command of these words as a Ray job, and return how to follow it.
 
     With the address `local`, it runs on a Ray head of this machine, which is started if needed. Returns once
     the command has begun or is queued. InputError where the cluster cannot be reached or refuses the job.
@@ -59,8 +58,7 @@ def detach_job(words: Sequence[str], path: str, job_options: JobOptions) -> JobR
     ]
     if job_options.address == "local":
         rows.append(("Ray", f"keeps running for later jobs; stop it: {command_line(['cancel', '--head'])}"))
-    print_rows(f"detached: {command_line(words)}", rows)
-    return JobResult(path, "detached")
+    return JobResult(path, "detached", resume=tuple(words), follow=tuple(rows))
 
 
 def in_ray_job(options: Options) -> Options:

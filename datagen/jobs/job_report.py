@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from datagen.cluster.protocol import EXIT_CODES
 from datagen.console.command_lines import command_line, print_interrupted
-from datagen.console.printing import counted, listed, print_json, print_lines, print_rows, seconds
+from datagen.console.printing import (
+    counted,
+    listed,
+    print_json,
+    print_lines,
+    print_rows,
+    seconds,
+    summary_of_stored,
+)
 from datagen.schemas.errors import one_line
 from datagen.schemas.jobs import StoredJob
 
@@ -33,7 +42,10 @@ class JobResult:
     store: str = ""  # the sealed store, which zarr and xarray open
     scenes: int = 0  # that a dry run would make
     cause: str = ""  # the most frequent one of a failed job
-    resume: tuple[str, ...] = ()  # words of the command that continues, or of a dry run
+    resume: tuple[str, ...] = ()  # words of the command that continues, was detached, or a dry run would run
+    follow: tuple[
+        tuple[str, str], ...
+    ] = ()  # of a detached job: its submission, and how to follow and stop it
 
     @property
     def complete(self) -> bool:
@@ -84,19 +96,34 @@ def health_line(job: StoredJob) -> str:
 
 def print_job(result: JobResult, *, json: bool = False, **_: Any) -> int:
     """Print the summary of a job and return the exit code."""
-    if result.end == "dry-run":
-        _print_dry_run(result, json)
-    elif result.end != "detached":  # `detach_job` has printed how to follow it
-        _print(result)
+    with nullcontext() if result.end == "dry-run" else summary_of_stored():
+        if json:
+            print_json(_document(result))
+        elif result.end == "dry-run":
+            _print_dry_run(result)
+        elif result.end == "detached":
+            print_rows(f"detached: {command_line(result.resume)}", result.follow)
+        else:
+            _print(result)
+    if result.end == "failed":
+        most = f", most often by: {result.cause}" if result.cause else ""
+        see = command_line(["status", result.path])
+        sys.stderr.write(
+            one_line(f"error: {result.path}: too many shards are quarantined{most}. See: {see}") + "\n"
+        )
+    if result.end == "interrupted":
+        print_interrupted(f"; {counted(result.remaining, 'shard')} left", result.resume)
     return result.exit_code
 
 
-def _print_dry_run(result: JobResult, json: bool) -> None:
+def _document(result: JobResult) -> dict[str, Any]:
+    values = {"run": result.path, **vars(result), "command": command_line(result.resume)}
+    del values["path"], values["resume"]
+    return values | {"follow": dict(result.follow), "quarantined": list(result.quarantined)}
+
+
+def _print_dry_run(result: JobResult) -> None:
     command = command_line(result.resume)
-    if json:
-        report = {"run": result.path, "n": result.n, "made_from": result.made_from}
-        print_json(report | {"scenes": result.scenes, "shards": result.shards, "command": command})
-        return
     rows = [
         ("labels", f"{result.n:,}"),
         ("made from", result.made_from),
@@ -128,12 +155,6 @@ def _print(result: JobResult) -> None:
     if result.store:
         rows.append(("store", f"{result.store}: zarr.open or xarray.open_zarr reads it"))
     print_rows(f"{result.end}: {path}", rows)
-    if result.end == "failed":
-        most = f", most often by: {result.cause}" if result.cause else ""
-        see = command_line(["status", path])
-        sys.stderr.write(one_line(f"error: {path}: too many shards are quarantined{most}. See: {see}") + "\n")
-    if result.end == "interrupted":
-        print_interrupted(f"; {counted(result.remaining, 'shard')} left", result.resume)
 
 
 def _time(result: JobResult) -> str:
