@@ -33,7 +33,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
         if run.storage.exists(commit_key(task.shard)):  # by another driver, while this attempt was queued
             return AttemptResult(False, 0, 0, meter.cost())
     stored = None if scenes_run is None else list(read_scenes(scenes_run, task.scene_indices))
-    made = run_shard(task.spec, world, task.scene_indices, stored)
+    made = run_shard(task.spec, world, task.scene_indices, stored, meter.watch)
     with ends_job(), made.clock.stage("write"):
         data = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
         entry = run.write_object(task.attempt, data)

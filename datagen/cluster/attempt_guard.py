@@ -22,7 +22,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cache
@@ -31,6 +31,7 @@ from typing import TypeVar
 
 import psutil
 
+from datagen.cluster.heartbeat import Running, Watch, beat_path, beating, running_here
 from datagen.cluster.protocol import AttemptReport, AttemptResult, JobCannotContinue, Task
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.run_records import Cost, Host, Outcome, StageClock
@@ -45,9 +46,10 @@ _CAUSE_LIMIT = 300  # a cause is read in a table and on a progress line; the sta
 
 
 class Meter:
-    """Measures the cost of an attempt from its creation on."""
+    """Measures the cost of an attempt from its creation on, and passes its progress on."""
 
     def __init__(self) -> None:
+        self.watch: Watch | None = None  # reports the attempt's progress to the driver's display
         self._wall, self._cpu = time.perf_counter(), time.process_time()
         _reset_peak_memory()
 
@@ -73,7 +75,7 @@ def guarded(function: Callable[[T, Meter], AttemptResult], task: T, deadline: bo
     meter = Meter()
     begun = AttemptReport(task.attempt, task.shard, "failed", started=utc_now(), host=this_host())
     try:
-        with _notes(task, begun.started, deadline):
+        with _notes(task, begun.started, deadline), _progress(task, meter):
             try:
                 product = function(task, meter)
             except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
@@ -137,6 +139,14 @@ def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
         faulthandler.enable(sys.__stderr__)
     note.unlink(missing_ok=True)
     stack.unlink(missing_ok=True)
+
+
+@contextmanager
+def _progress(task: Task, meter: Meter) -> Generator[None]:
+    with (
+        beating(beat_path(_folder(task.notes), task.attempt)) if task.notes else nullcontext() as meter.watch
+    ):
+        yield
 
 
 @cache
@@ -227,8 +237,8 @@ def collect_post_mortem(notes: str, attempt: str) -> Note:
             note = replace(note, stack=file.read(STACK_LIMIT).decode(errors="replace"))
     except FileNotFoundError:
         pass
-    path.unlink(missing_ok=True)
-    note_path(notes, attempt).unlink(missing_ok=True)
+    for file in (path, note_path(notes, attempt), beat_path(_folder(notes), attempt)):
+        file.unlink(missing_ok=True)
     return note
 
 
@@ -262,6 +272,11 @@ def failure_report(task: Task, outcome: Outcome, cause: str, left: Note | None =
         cost=Cost(wall_s=max(0.0, wall_s), cpu_s=0.0) if left.host else None,
         host=left.host,
     )
+
+
+def running_attempts(notes: str) -> Running:
+    """The progress of the attempts of a job that run on this machine."""
+    return running_here(_folder(notes)) if notes else Running()
 
 
 def _folder(notes: str) -> Path:

@@ -9,6 +9,8 @@ import os
 import platform
 from contextlib import suppress
 
+from datagen.cluster.attempt_guard import running_attempts
+from datagen.cluster.heartbeat import Running
 from datagen.cluster.protocol import AttemptReport, JobSummary, JobTotals, StopRequest
 from datagen.display.progress import Pace, Progress, clock_text, whole
 from datagen.schemas.errors import InputError
@@ -18,17 +20,20 @@ from datagen.schemas.record_files import utc_now
 # Environment variables of a detached job: its submission id at Ray, and the address of Ray's Jobs API.
 SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"
 BEAT_S, LOOK_S = 10.0, 3.0  # between two states, and between two looks for a request to stop
+NOTES_S = 1.0  # between two looks at the progress of running attempts
 
 
 class JobProgress:
     """A driver's events, shown: shards done, rate, time left, retries, quarantined shards, cost so far.
 
-    `done_before` counts the shards of earlier jobs.
+    `done_before` counts the shards of earlier jobs. Rate and time left include the labels of unfinished
+    shards on this machine, from the job's notes.
     """
 
-    def __init__(self, shown: Progress, labels_per_shard: int, done_before: int = 0) -> None:
+    def __init__(self, shown: Progress, labels_per_shard: int, done_before: int = 0, notes: str = "") -> None:
         self._shown, self._pace, self._labels_per_shard = shown, Pace(shown.clock), labels_per_shard
         self._done_before, self._reason = done_before, ""
+        self._notes, self._running, self._next_note_s = notes, Running(), float("-inf")
 
     def ended(self, report: AttemptReport, action: str) -> None:
         if action in ("retry", "quarantine", "abort"):
@@ -38,7 +43,9 @@ class JobProgress:
             self._shown.say("attempt_" + report.outcome, {**values, "action": action}, text, style)
 
     def tick(self, totals: JobTotals) -> None:
-        self._pace.see(totals.labels)
+        if (now_s := self._shown.clock()) >= self._next_note_s:
+            self._running, self._next_note_s = running_attempts(self._notes), now_s + NOTES_S
+        self._pace.see(totals.labels + self._running.labels)
         done, of = self._done_before + totals.finished, self._done_before + totals.shards
         self._shown.update("shards", done, of, lambda: self._figures(totals))
 
@@ -49,21 +56,33 @@ class JobProgress:
 
     def left_s(self, totals: JobTotals) -> float | None:
         """Seconds until the last shard at the rate of the last minute; None while it is unknown."""
-        return self._pace.left_s((totals.shards - totals.finished) * self._labels_per_shard)
+        more = (totals.shards - totals.finished) * self._labels_per_shard
+        return self._pace.left_s(more - self._running.labels)
 
     def _figures(self, totals: JobTotals) -> tuple[str, dict[str, object]]:
         rate, left_s = self._pace.per_s(), self.left_s(totals)
         cpu_s = totals.useful_cpu_s + totals.wasted_cpu_s
-        # Rare figures are omitted when 0, to fit 80 columns.
-        quarantined = f"  {totals.quarantined} quarantined" if totals.quarantined else ""
-        text = (
-            f"{rate:,.0f} labels/s  {clock_text(left_s)} left  {totals.retries} retries{quarantined}  "
-            f"{cpu_s / 3600:.2f} core-h{'  stopping' if self._reason else ''}"
+        grasps = self._running.in_grasps
+        text = "  ".join(
+            part
+            for part, is_shown in (
+                (f"{rate:,.0f} labels/s", True),
+                (f"{clock_text(left_s)} left", True),
+                # Rare figures are omitted when 0, and the cost while others need its room, to fit 80 columns.
+                (f"computing grasps of {grasps} object{'s' if grasps > 1 else ''}", grasps),
+                (f"{totals.retries} retries", totals.retries),
+                (f"{totals.quarantined} quarantined", totals.quarantined),
+                (f"{cpu_s / 3600:.2f} core-h", not grasps),
+                ("stopping", self._reason),
+            )
+            if is_shown
         )
         return text, {
             "shards_done": self._done_before + totals.finished,
             "shards": self._done_before + totals.shards,
             "labels": totals.labels,
+            "labels_in_flight": self._running.labels,
+            "objects_in_grasps": self._running.in_grasps,
             "labels_per_s": round(rate, 1),
             "left_s": whole(left_s),
             "in_flight": totals.in_flight,
@@ -84,8 +103,9 @@ class JobMonitor(JobProgress):
         shown: Progress,
         labels_per_shard: int,
         done_before: int = 0,
+        notes: str = "",
     ) -> None:
-        super().__init__(shown, labels_per_shard, done_before)
+        super().__init__(shown, labels_per_shard, done_before, notes)
         self._recorder, self._stop, self._clock = recorder, stop, shown.clock
         self._next_beat_s = self._next_look_s = self._clock()
 

@@ -34,7 +34,7 @@ from datagen.cluster.ray_executor import RayExecutor, ray_executor
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.shard_policy import RetryPolicy, too_many_quarantined
 from datagen.console.command_lines import Interrupted, command_line, resumable
-from datagen.console.options import RUNNING, Whole, option
+from datagen.console.options import JSON_HELP, RUNNING, Whole, option
 from datagen.console.printing import counted
 from datagen.display.progress import Progress
 from datagen.jobs.job_report import JobResult
@@ -65,7 +65,7 @@ class JobOptions:
     no_seal: Annotated[bool, option("Leave out the joint store data.zarr; readers open runs.", RUNNING)] = (
         False
     )
-    json: Annotated[bool, option("Print progress as JSON lines to standard error.", RUNNING)] = False
+    json: Annotated[bool, option(JSON_HELP, RUNNING)] = False
     quiet: Annotated[bool, Parameter(parse=False)] = False  # the command line always reports progress
 
     def refuse_bad(self) -> None:
@@ -204,7 +204,7 @@ class Job:
             refuse_unfit_machines(executor.others.ask, run, probe)
         shown.phase("making labels")
         done = len(run.planned()) - len(shards)
-        events = JobMonitor(recorder, stop, shown, layout.samples_per_shard, done)
+        events = JobMonitor(recorder, stop, shown, layout.samples_per_shard, done, notes)
         return drive(shards, make_task, executor, RunRecorder(run), self.policy, events, stop)
 
     def _executor(self, shards: int, stack: ExitStack, shown: Progress) -> Executor[ShardTask]:

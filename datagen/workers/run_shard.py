@@ -11,7 +11,7 @@ check the batch against its schema
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +29,7 @@ from datagen.workers.rendering import Camera
 from datagen.workers.scenes import Scene
 from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_candidates, reconstruct_scene
+from datagen.workers.watched_clock import WatchedClock
 from datagen.workers.world import World
 
 Columns = dict[str, np.ndarray[Any, Any]]
@@ -49,16 +50,18 @@ def run_shard(
     world: World,
     scene_indices: Sequence[int],
     stored: Iterable[SceneRows] | None = None,
+    watch: Callable[[str, int], None] | None = None,
 ) -> ShardResult:
     """Generate the scenes of these indices, or read them from `stored`, and label their candidates.
 
     The same specification and index give the same bytes, whatever else is in the shard. Stored
-    scenes keep their bytes. Raises InputError
+    scenes keep their bytes. `watch(stage, labels)` is called when a stage begins. Raises InputError
     if a stored scene does not match its index, or its house and objects are not those of the world.
     """
     source, spec_hash = load_label_source(spec.label_source), spec.hash()
     schema = sized_schema(source.schema, spec)
-    clock, redraws = StageClock(), Counter[str]()
+    clock, redraws = WatchedClock(), Counter[str]()
+    clock.watch = watch or clock.watch
     scene_rows: list[Mapping[str, Any]] = []
     sample_blocks: list[Columns] = []
     rows_of = [None] * len(scene_indices) if stored is None else stored
@@ -73,6 +76,7 @@ def run_shard(
         labelled = source.label(scene, candidates, spec, clock)
         scene_rows.append(record)
         sample_blocks.append(candidate_columns(index, candidates, spec_hash, source) | labelled)
+        clock.labels = sum(len(block["label"]) for block in sample_blocks)
 
     scene_columns = {
         f.name: _stack(f.dtype, [row[f.name] for row in scene_rows]) for f in schema.scene_fields

@@ -133,10 +133,10 @@ def test_lines_come_at_intervals_and_for_each_failure_as_json_and_as_text() -> N
     assert said[2]["labels_per_s"] == 60.0 and said[2]["left_s"] == 70
     assert said[3]["shard"] == 5 and said[3]["action"] == "retry"
     assert thirty_seconds(as_json=False)[2:] == [
-        "shards 80/150  60 labels/s  0:01:10 left  0 retries  0.00 core-h",
+        "shards 80/150  60 labels/s  0:01:10 left  0.00 core-h",
         "shard 5 crashed: Fatal Python error: Segmentation fault (retry)",
         "asked to stop: waiting for running attempts; Ctrl-C again stops at once",
-        "shards 80/150  60 labels/s  0:01:10 left  0 retries  0.00 core-h  stopping",
+        "shards 80/150  60 labels/s  0:01:10 left  0.00 core-h  stopping",
     ]
 
 

@@ -19,6 +19,7 @@ from datagen.workers.labels.arm_labelling import (
 )
 from datagen.workers.motion import MotionPlan
 from datagen.workers.scenes import SettledScene
+from datagen.workers.watched_clock import count_label
 
 # 3: four different seeds of inverse kinematics for each grasp.
 VERSION = 3
@@ -62,6 +63,7 @@ def label_with_trials(
         _write(columns, row, trial)
         if trial.plan is not None:
             _write_plan(columns, row, arms[key], arms[key].base_pose(candidates, row), trial.plan)
+        count_label(clock)
     columns["label"] = (columns["outcome"] == _CODES["success"]).astype(np.uint8)
     return columns, trials
 

@@ -33,6 +33,7 @@ from datagen.workers.motion import MotionPlan
 from datagen.workers.scenes import SettledScene
 from datagen.workers.trials import TrialResult
 from datagen.workers.trials.execute import run_trial
+from datagen.workers.watched_clock import WatchedClock
 from tests.workers.motion.tables import scene_of
 from tests.workers.worlds import box_model, on_table, table_house
 
@@ -248,3 +249,14 @@ def test_fewer_repeats_are_the_first_of_more() -> None:
     for a, b in zip(few, many, strict=False):
         np.testing.assert_array_equal(a.T_target_moved, b.T_target_moved)
         assert a.object_friction == b.object_friction
+
+
+def test_a_watched_clock_counts_each_label_and_changes_none(labelled: dict[str, Any]) -> None:
+    at, clock, seen = scene(), WatchedClock(), list[tuple[str, int]]()
+    clock.watch = lambda stage, labels: seen.append((stage, labels))
+    columns = load_label_source("plan").label(at, candidates(at), specification(), clock)
+    assert clock.labels == len(OFFSETS_M)
+    assert seen[0][1] == 0 and seen[-1][1] > 0 and {"grasps", "plan"} <= {stage for stage, _ in seen}
+    assert [labels for _, labels in seen] == sorted(labels for _, labels in seen)
+    for name, values in labelled["plan"].items():
+        np.testing.assert_array_equal(columns[name], values, err_msg=name)
