@@ -21,6 +21,7 @@ from datagen.schemas.errors import printable
 
 _WIDTH_IN = 11.0  # at 800 pixels, as pages show pictures, text of 10 points is then 10 pixels high
 _DPI = 120
+_LINE_IN = 0.152  # of facts
 _MOST_CHARACTERS = 60  # in a name: a longer one leaves no room for axes
 
 
@@ -49,15 +50,17 @@ def draw_frame(axes: Axes, rgb: Any, target: Any, title: str = "RGB frame, targe
     axes.set_title(title)
 
 
-def write_facts(axes: Axes, facts: Sequence[tuple[str, str]], head_characters: int = 12) -> None:
-    """Write (head, text) pairs into a panel of half the sheet's width."""
+def write_facts(axes: Axes, facts: Sequence[tuple[str, str]], head_characters: int = 12) -> float:
+    """Write (head, text) pairs into a panel of half the sheet's width; returns the height in inches."""
     axes.set_axis_off()
     indent = " " * head_characters
     lines = [
         textwrap.fill(f"{head:<{head_characters}}{text}", 66, subsequent_indent=indent)
         for head, text in facts
     ]
-    axes.text(0, 1, "\n".join(lines), va="top", family="monospace", fontsize=9, transform=axes.transAxes)
+    text = "\n".join(lines)
+    axes.text(0, 1, text, va="top", family="monospace", fontsize=9, transform=axes.transAxes)
+    return _LINE_IN * (text.count("\n") + 3)
 
 
 def plain(text: str) -> str:

@@ -34,7 +34,7 @@ _HEAD_ROOM_M = 1.9  # higher parts, such as the wall over a door, are not drawn
 _KIND_EDGE = {"wall": "#303030", "furniture": "#6b5b4a", "small": "#8a6fb0"}
 _DOT_PT2, _SMALL_PT2 = 26, 11  # small: frequent outcomes of little interest
 _OF_LITTLE_INTEREST = ("out_of_reach", "base_collision")
-_LEGEND_CHARACTERS = 60
+_LEGEND_CHARACTERS, _LEGEND_LINE_IN = 60, 0.215
 
 Handle = Line2D | Patch
 
@@ -113,13 +113,17 @@ def draw_pick(axes: Axes, base_xy_m: F64, style: Style) -> Handle:
     return handle(style, style.words)
 
 
-def draw_legend(axes: Axes, handles: Sequence[Handle]) -> None:
-    """Draw a legend that fills a panel."""
+def draw_legend(axes: Axes, handles: Sequence[Handle]) -> float:
+    """Draw a legend that fills a panel; returns its height in inches."""
     axes.set_axis_off()
+    lines = 0
     for entry in handles:
-        entry.set_label(textwrap.fill(str(entry.get_label()), _LEGEND_CHARACTERS))
+        text = textwrap.fill(str(entry.get_label()), _LEGEND_CHARACTERS)
+        entry.set_label(text)
+        lines += text.count("\n") + 1
     look: dict[str, Any] = {"frameon": False, "borderaxespad": 0, "labelspacing": 0.5, "handlelength": 2}
     axes.legend(handles=handles, loc="upper left", fontsize=10, **look)
+    return _LEGEND_LINE_IN * (lines + 1)
 
 
 def handle(style: Style, text: str, is_filled: bool = True) -> Handle:

@@ -25,6 +25,7 @@ Columns = Mapping[str, Any]
 Lines = list[tuple[str, str]]  # printed next to a picture
 
 _MOST_ROBOTS = 4
+_PLANS_IN = 3.7  # height of the upper half
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +67,9 @@ def draw_scene_picture(shown: Shown, out: Path) -> Lines:
     """Write the picture of a scene; return its positives and its best base poses."""
     samples, tau = shown.samples, shown.spec.heuristic.tau
     xy, score = np.asarray(samples["base_xy_m"], np.float64), np.asarray(samples["heuristic_score"])
-    figure = new_sheet(shown.title, 6.6)
-    upper, lower = np.asarray(figure.subfigures(2, 1, height_ratios=(3.7, 2.9))).tolist()
+    figure = new_sheet(shown.title, 2 * _PLANS_IN)
+    grid = figure.add_gridspec(2, 1)
+    upper, lower = (figure.add_subfigure(grid[k]) for k in range(2))
     frame_ax, label_ax, score_ax = upper.subplots(1, 3, width_ratios=(1.05, 1, 1))
     draw_frame(frame_ax, shown.frame.rgb, shown.frame.body == 1)
     marks = draw_plan(label_ax, shown.recalled, xy)
@@ -84,8 +86,13 @@ def draw_scene_picture(shown: Shown, out: Path) -> Lines:
     facts_ax, legend_ax = lower.subplots(1, 2, width_ratios=(1.15, 1))
     positive = f"{int(samples['label'].sum())} of {len(samples['label'])} candidates"
     best = [(head, _described(shown, row)) for head, (row, _) in _picks(samples).items()]
-    write_facts(facts_ax, [*_facts(shown), ("positive", positive), *best], 15)
-    draw_legend(legend_ax, [*legend, *marks])
+    texts_in = (
+        write_facts(facts_ax, [*_facts(shown), ("positive", positive), *best], 15),
+        draw_legend(legend_ax, [*legend, *marks]),
+    )
+    # As high as its longer text: four robots and a dozen outcomes need twice the room of a short list.
+    grid.set_height_ratios((_PLANS_IN, max(texts_in)))
+    figure.set_figheight(_PLANS_IN + max(texts_in))
     save_sheet(figure, out)
     return [("positive", positive), *best]
 

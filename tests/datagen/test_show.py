@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image, ImageColor, ImageSequence
 
 from datagen import cli
 from datagen.display.styles import OUTCOME_STYLES
-from datagen.drawing.scene_picture import best_success
+from datagen.drawing.scene_picture import Shown, best_success, draw_scene_picture
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_scene
@@ -44,12 +46,41 @@ def show(run: Path, out: Path, *more: str) -> np.ndarray:
 @pytest.mark.parametrize("name", ["plan", "sim"])
 def test_a_scene_is_drawn_with_its_outcomes(name: str, paired: dict[str, Path], tmp_path: Path) -> None:
     pixels = show(paired[name], tmp_path / "scene.png")
-    assert pixels.shape == (792, 1320, 3)
+    assert pixels.shape[1] == 1320
     outcome_map = pixels[40:460, 420:800]
     codes, counts = np.unique(arrays_of(paired[name])["outcome"], return_counts=True)
     for code in codes[counts > 2]:  # the stars of two picks may hide two
         colour = ImageColor.getrgb(OUTCOME_STYLES[NAMES[code]].colour)
         assert (outcome_map == colour).all(axis=2).sum() > 5, NAMES[code]
+
+
+@pytest.mark.parametrize("outcomes", [1, 4, len(NAMES)])
+def test_no_text_of_a_picture_lies_on_another(
+    outcomes: int, paired: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four robots, long names of objects, and up to all outcomes, with bases that fit and that do not."""
+    run = Run.open(str(paired["plan"]))
+    rows = read_scene(run, 0)
+    n, spec = 2 * len(NAMES), run.manifest.spec
+    samples = {name: np.resize(values, (n, *values.shape[1:])) for name, values in rows.samples.items()}
+    samples["outcome"] = (np.arange(n) // 2 % outcomes).astype(np.uint8)
+    samples["base_is_clear"] = np.arange(n) % 2 == 0
+    samples["robot_index"] = np.arange(n) % 4
+    scene = reconstruct_scene(open_world(spec, "builtin", "builtin"), rows.record)
+    drawn: list[Figure] = []
+    monkeypatch.setattr("datagen.drawing.scene_picture.save_sheet", lambda figure, out: drawn.append(figure))
+    draw_scene_picture(Shown("run", spec, replace(rows, samples=samples), scene), tmp_path / "a.png")
+    figure = drawn[0]
+    figure.canvas.draw()
+    lower = figure.subfigs[1]
+    facts, legend = lower.axes[0].texts[0].get_window_extent(), lower.axes[1].get_legend().get_window_extent()
+    plans = [axes.get_tightbbox() for axes in figure.subfigs[0].axes]
+    for box in (facts, legend):
+        assert box.y0 >= 0 and box.x0 >= 0 and box.x1 <= figure.bbox.x1
+        assert not any(box.overlaps(plan) for plan in plans)
+    assert not facts.overlaps(legend)
+    left_px = min(facts.y0, legend.y0)
+    assert left_px < 0.1 * figure.bbox.height  # no empty band below them
 
 
 @pytest.mark.parametrize("name", ["plan", "sim", "disturbed"])
