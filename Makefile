@@ -12,7 +12,7 @@ DEMO := build/demo
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo    600 labels on the built-in world, a picture, status and audit (in $(DEMO))"
+	@echo "make demo    600 labels on the built-in world, a picture and the next command (in $(DEMO))"
 	@echo "make paper-small  labels, training and tables on real houses, small (DATAGEN_ASSETS; in build/paper-small)"
 	@echo "make paper   the same with as many labels as the paper has (in build/paper)"
 	@echo "make model   the released model, its benchmark and its closed loop (in build/model)"
@@ -42,11 +42,11 @@ venv-labels:
 demo: venv-labels
 	@rm -rf $(DEMO)
 	@mkdir -p $(DEMO)
-	$(BIN)/datagen submit heuristic --n 600 --out $(DEMO)/run
-	$(BIN)/datagen show $(DEMO)/run --scene 0 --out $(DEMO)/scene-0.png
-	$(BIN)/datagen status $(DEMO)/run
-	$(BIN)/datagen audit $(DEMO)/run
-	@echo "the picture: $(DEMO)/scene-0.png"
+	$(BIN)/datagen submit heuristic --n 600 --candidates in-range --out $(DEMO)/run
+	$(BIN)/datagen show $(DEMO)/run --scene 9 --out $(DEMO)/scene.png
+	@echo
+	@echo "The picture: $(DEMO)/scene.png"
+	@echo "Next, the cost of these labels and of 180,000: $(BIN)/datagen audit $(DEMO)/run"
 
 # All three go on where they were stopped.
 paper-small: venv

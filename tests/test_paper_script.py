@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from datagen.cli import build_app
+from datagen.commands.train import model_sizes
+from datagen.train.models import build_model
 from tests.conftest import REPOSITORY
 
 SCRIPT = Path(__file__).resolve().parent.parent / "scripts" / "paper.sh"
@@ -62,18 +64,28 @@ def test_its_commands_are_ours_and_the_slow_ones_are_not_repeated(place: Path, s
     for words in called:
         build_app(words[0]).parse_args(words, exit_on_error=False, print_error=False)
     verbs = [words[0] for words in called]
-    assert verbs == ["assets"] + ["submit"] * 7 + ["calibrate", "relabel"] + ["train"] * 5 + ["evaluate"]
+    assert verbs == ["assets"] + ["submit"] * 7 + ["calibrate", "relabel"] + ["train"] * 8 + ["evaluate"]
     splits = {words[words.index("--out") + 1]: words[words.index("--split") + 1] for words in called[1:8]}
     assert sorted(splits.values()) == ["test"] * 2 + ["train"] * 3 + ["val"] * 2
     trained = {word for words in called if words[0] == "train" for word in words}
     for run, split in splits.items():
         assert (run in trained) == (split != "test" and not run.endswith("heuristic")), run
     assert (place / "out" / "tables.json").is_file()
+    # The paper's network in each regime, of a size that the model accepts; ours otherwise.
+    of_paper = [words for words in called if "--model" in words]
+    assert [(words[1], words[words.index("--model") + 1]) for words in of_paper] == [
+        ("stage1", "paper"), ("sim-only", "paper"),
+    ]  # fmt: skip
+    (sizes,) = {words[words.index("--model-config") + 1] for words in of_paper}
+    build_model("paper", model_sizes([sizes]))
+    judged = {Path(word).stem for word in called[-1] if word.endswith(".ckpt")}
+    assert {"paper-stage1", "paper-sim-only", "paper-stage2", "stage2"} <= judged
+    assert any(words[1] == "stage2" and words[-1].endswith("paper-stage1.ckpt") for words in called)
 
     (place / "notes").unlink()
     assert tell(place, size, "out", DATAGEN_ASSETS="assets").returncode == 0
     again = [words[0] for words in notes(place)]  # those that go on by themselves
-    assert again == ["assets"] + ["submit"] * 7 + ["relabel"] + ["train"] * 5
+    assert again == ["assets"] + ["submit"] * 7 + ["relabel"] + ["train"] * 8
 
 
 def test_it_stops_where_a_step_fails(place: Path) -> None:

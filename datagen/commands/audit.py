@@ -14,8 +14,10 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.run import open_runs
 
 
-def audit(runs: Annotated[list[str], Parameter(name="RUN...")], /, *, json: AsJson = False) -> int:
-    """Show what was made, what it cost by stage and per label, what was wasted, and what 180,000 would cost.
+def audit(
+    runs: Annotated[list[str], Parameter(name="RUN...")], /, *, full: bool = False, json: AsJson = False
+) -> int:
+    """Show what was made, what it cost per label, what was wasted, and what 180,000 would cost.
 
     Costs are core time: CPU seconds, and the wall time of killed attempts. A label costs its run's whole
     cost, waste included, divided by the labels of that kind. Name the run that made the scenes beside runs of
@@ -26,6 +28,7 @@ def audit(runs: Annotated[list[str], Parameter(name="RUN...")], /, *, json: AsJs
 
     Args:
         runs: Runs of one or several label sources.
+        full: Also show costs by stage, rejected scenes, and the paper's costs.
     """
     if not runs:
         raise InputError("datagen audit", "RUN", "is missing", "Name one or more run folders")
@@ -33,5 +36,5 @@ def audit(runs: Annotated[list[str], Parameter(name="RUN...")], /, *, json: AsJs
     if json:
         print_json(report)
     else:
-        print_audit(report)
+        print_audit(report, full)
     return 0 if report["is_exact"] else 1

@@ -34,6 +34,7 @@ def evaluate(
     given: AssetSources = AS_FOUND,
     allow_seen_houses: bool = False,
     out: Outputs = None,
+    full: bool = False,
     json: AsJson = False,
 ) -> dict[str, Any]:
     """Compare models with baselines and the paper: accuracy, reach, grid selection and calibration.
@@ -60,6 +61,7 @@ def evaluate(
         workers: Processes of the closed loop; 0: this process, for debuggers. [default: cores]
         allow_seen_houses: Report training houses separately instead of failing.
         out: File to write, .json or .html; repeat for both.
+        full: Print all tables and notes.
 
     Returns:
         All numbers, as `datagen evaluate --json` prints them (docs/guides/evaluate.md).

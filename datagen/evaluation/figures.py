@@ -24,7 +24,7 @@ from datagen.display.styles import (
 )
 from datagen.evaluation.columns import Columns
 from datagen.evaluation.grids import AT_RANDOM, BY_LABELS, PICKS, picks
-from datagen.evaluation.report_tables import METRIC_WORDS, Report, models_first
+from datagen.evaluation.report_tables import METRIC_WORDS, Report, models_first, paper_accuracy
 from datagen.train.inputs import F64, I64
 
 _SHOWN = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick")
@@ -63,7 +63,7 @@ def draw_intervals(report: Report, scores: Report) -> Figure:
     for ax, metric in zip(panels, _SHOWN, strict=True):
         for y, record in enumerate(records):
             _draw_estimate(ax, y, scores["methods"][record["name"]][metric], looks[record["name"]])
-            stated = report["paper"]["accuracy"].get(record["regime"] or record["name"])
+            stated = paper_accuracy(record, report)
             if metric == "accuracy" and stated is not None:
                 ax.plot(100 * stated, y, "|", ms=16, mew=2, color="black")
         if metric in ("balanced_accuracy", "area_under_roc"):

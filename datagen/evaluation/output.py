@@ -40,15 +40,15 @@ def write_report(report: dict[str, Any], columns: Columns, files: Sequence[Path]
 
 
 def print_report(
-    report: dict[str, Any], json: bool, out: Sequence[str | Path] | None = None, **_: Any
+    report: dict[str, Any], json: bool, out: Sequence[str | Path] | None = None, full: bool = True, **_: Any
 ) -> int:
-    """Print the tables of a report, or the report as JSON."""
+    """Print a summary or, with `full`, the tables of a report; or the report as JSON."""
     if json:
         print_json(report)
         return 0
     from datagen.evaluation.report_page import print_evaluation
 
-    print_evaluation(report)
+    print_evaluation(report, full)
     if out:
         print_rows("written", [("", str(file)) for file in out])
     return 0

@@ -21,8 +21,8 @@ from datagen.train.bootstrap import LEVEL
 
 RESAMPLES = 1000
 # GBPP: Grasp-Aware Base Placement Prediction for Robots via Two-Stage Learning, Tables I to III and text. Not
-# directly comparable: it has other candidates, houses and arms. `accuracy` is by method or regime; numbers of
-# grids are those of the two-stage model, its time that of a laptop's RTX 4090.
+# directly comparable: it has other candidates, houses and arms. `accuracy` is by baseline, and by regime of
+# its network; numbers of grids are those of the two-stage model, its time that of a laptop's RTX 4090.
 PAPER = {
     "source": "GBPP, arXiv:2509.11594",
     "accuracy": {

@@ -18,6 +18,7 @@ from datagen.evaluation.report_tables import (
     notes,
     set_tables,
 )
+from datagen.evaluation.summary import summary_tables
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,8 +32,12 @@ class Picture:
     caption: str
 
 
-def print_evaluation(report: Report) -> None:
-    """Print the tables, except details, and the notes."""
+def print_evaluation(report: Report, full: bool) -> None:
+    """Print the tables, except details, and the notes; without `full` one short table of each part."""
+    if not full:
+        for table in summary_tables(report):
+            print_rows(table.title, table.rows, table.heads)
+        return
     for block in blocks(report):
         if isinstance(block, str):
             print_rows(block, [])

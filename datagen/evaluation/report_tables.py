@@ -20,7 +20,7 @@ METRIC_WORDS = {
     "mean_average_precision": "mAP",
     "smoothed": "success",
 }
-_SET_WORDS = {
+SET_WORDS = {
     "in-range": "clear and within reach",
     "clear": "clear",
     "grid": "all cells; methods know where the base collides",
@@ -55,7 +55,9 @@ def set_tables(report: Report, scores: Report) -> Iterator[Table]:
 def _accuracy(report: Report, scores: Report) -> Table:
     """Table I: decisions and calibration of every method, the paper's accuracy, and the base rate."""
     share = scores["positives"] / scores["count"]
-    of_methods = [(_label(r), scores["methods"][r["name"]], _paper(r, report)) for r in report["methods"]]
+    of_methods = [
+        (label_of(r), scores["methods"][r["name"]], paper_accuracy(r, report)) for r in report["methods"]
+    ]
     of_means = [(mean["name"], mean, None) for mean in scores["means"]]
     rows = [
         (
@@ -69,7 +71,7 @@ def _accuracy(report: Report, scores: Report) -> Table:
     rows.append(("the commoner label", percent(max(share, 1 - share)), "50.0", "50.0", "-", "-"))
     words = f"{scores['count']:,} candidates of {scores['scenes']:,} scenes, {percent(share)}% positive"
     heads = ("method", *(METRIC_WORDS[metric] for metric in DECISIONS), "calibration error", "paper")
-    return Table(f"Table I, in %: {_SET_WORDS[scores['candidates']]}; {words}", heads, rows)
+    return Table(f"Table I, in %: {SET_WORDS[scores['candidates']]}; {words}", heads, rows)
 
 
 def comparison_tables(comparisons: Sequence[Report], where: str) -> Iterator[Table]:
@@ -95,11 +97,11 @@ def _reach(report: Report, scores: Report) -> Table:
     """Table II: accuracy within and beyond reach."""
     rows = [
         (
-            _label(record),
+            label_of(record),
             with_interval(scores["methods"][record["name"]]["accuracy_in_reach"]),
             with_interval(scores["methods"][record["name"]]["accuracy_out_of_reach"]),
-            percent(_paper(record, report)) if record["regime"] else "-",
-            percent(report["paper"]["accuracy_out_of_reach"]) if record["regime"] == "two-stage" else "-",
+            percent(paper_accuracy(record, report)) if record["regime"] else "-",
+            percent(report["paper"]["accuracy_out_of_reach"]) if _is_two_stage_of_paper(record) else "-",
         )
         for record in models_first(report["methods"])
     ]
@@ -242,7 +244,10 @@ def notes(report: Report) -> list[tuple[str, str]]:
         *_benchmark_notes(report.get("benchmark")),
         ("intervals", method),
         ("clearance", "every method knows where the base is clear, and predicts negative elsewhere"),
-        ("paper", f"{report['paper']['source']}: other houses, arms and candidates"),
+        (
+            "paper",
+            f"{report['paper']['source']}: other houses, arms and candidates; of the same method alone",
+        ),
     ]
     if any(table["means"] for part in report["parts"] for table in (*part["sets"].values(),)):
         found.append(
@@ -309,14 +314,24 @@ def _metres(estimate: Report) -> str:
     return f"{estimate['value']:.2f} [{low}, {high}]"
 
 
-def _label(record: Report) -> str:
+def label_of(record: Report) -> str:
     """A method's name, with * where it has no threshold."""
     return record["name"] + (" *" if record["threshold"] is None else "")
 
 
-def _paper(record: Report, report: Report) -> float | None:
-    """The paper's accuracy of the same method or regime, if there is one."""
+def paper_accuracy(record: Report, report: Report) -> float | None:
+    """The paper's accuracy of the same baseline, or of its own network in the same regime; else None."""
+    if record["regime"] and not _is_of_paper(record):
+        return None
     return report["paper"]["accuracy"].get(record["regime"] or record["name"])
+
+
+def _is_of_paper(record: Report) -> bool:
+    return record["checkpoint"] is not None and record["checkpoint"]["model"] == "paper"
+
+
+def _is_two_stage_of_paper(record: Report) -> bool:
+    return record["regime"] == "two-stage" and _is_of_paper(record)
 
 
 def models_first(records: Sequence[Report]) -> list[Report]:

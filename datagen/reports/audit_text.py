@@ -12,6 +12,12 @@ Source = Mapping[str, Any]
 # Costs that are no stages.
 _ADDED = ("other", "waste", "scenes of other runs", "relabelled files")
 _STAGES_SHOWN = (5, 5, 3)  # for one, two and more label sources, so that 25 lines suffice
+_OF_PAPER = " labels, one core"
+# Rows that are printed without --full.
+_ALWAYS = (
+    "labels", "  positive", "  within reach", "core time", "core time of a label",
+    "  of a label within reach", "wasted attempts",
+)  # fmt: skip
 _UNITS = {
     "label": "core time of a label",
     "label_within_reach": "  of a label within reach",
@@ -19,8 +25,11 @@ _UNITS = {
 }
 
 
-def print_audit(report: Mapping[str, Any]) -> None:
-    """Print what was made, its cost, the waste, and the cost of the paper's number of labels."""
+def print_audit(report: Mapping[str, Any], full: bool = False) -> None:
+    """Print what was made, its cost, the waste, and the cost of the paper's number of labels.
+
+    `full` adds costs by stage, rejected scenes, and the sizes and costs that only planning needs.
+    """
     if not report["is_exact"]:
         print_lines(
             f"the ledger does not add up: {counted(report['contradictions'], 'record')} of committed"
@@ -28,9 +37,12 @@ def print_audit(report: Mapping[str, Any]) -> None:
         )
     sources: Sequence[Source] = report["sources"]
     title = "; ".join(dict.fromkeys(source["made_from"] for source in sources))
-    print_rows(
-        title, [*_made(sources), *cost_rows(sources)], ("", *(source["label_source"] for source in sources))
-    )
+    rows = [
+        row
+        for row in (*_made(sources), *cost_rows(sources))
+        if full or row[0] in _ALWAYS or row[0].endswith(_OF_PAPER)
+    ]
+    print_rows(title, rows, ("", *(source["label_source"] for source in sources)))
     notes = [
         f"{source['label_source']}: add the run that made its scenes, whose cost is missing here"
         for source in sources
@@ -148,7 +160,7 @@ def _projection(sources: Sequence[Source]) -> list[tuple[str, ...]]:
 
     labels = sources[0]["projection"]["labels"]
     rows = [
-        _row(f"{labels:,} labels, one core", sources, lambda s: time(s["projection"]["core_days"])),
+        _row(f"{labels:,}{_OF_PAPER}", sources, lambda s: time(s["projection"]["core_days"])),
         _row("  within reach", sources, lambda s: time(s["projection"]["core_days_within_reach"])),
         _row("  in the paper", sources, paper),
         _row("  stored", sources, stored),

@@ -77,18 +77,24 @@ def test_scenes_of_another_run_are_charged_where_that_run_is_named(tmp_path: Pat
     assert audit_runs([maker, other, maker])["agreement"] == []  # other scenes, and a run twice
 
 
-def test_a_terminal_shows_all_answers_in_25_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_terminal_shows_the_answers_in_a_dozen_lines_and_all_in_25(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     maker = make_run(tmp_path / "maker", n=50)
     run = relabelled(tmp_path / "run", maker, 50, seed=1)
     maker.ledger.start("bad", 0)
     maker.ledger.end(LedgerEntry(attempt="bad", shard=0, outcome="failed", cost=None, cause="ValueError: no"))
     for paths in ([maker.storage.url], [maker.storage.url, run.storage.url]):
+        answers = ("labels", "core time of a label", "1 failed of", "ValueError: no", "180,000 labels")
         assert cli.run(["audit", *paths]) == 0
+        short = capsys.readouterr().out
+        assert cli.run(["audit", *paths, "--full"]) == 0
         shown = capsys.readouterr().out
-        assert len(shown.splitlines()) <= 25
-        for answer in ("labels", "core time", "1 failed of", "ValueError: no", "180,000 labels", "< 3 GPU"):
-            assert answer in shown
-    assert "heuristic equals heuristic for" in shown
+        notes = 1 + (len(paths) > 1)  # causes of waste, and agreement
+        assert len(short.splitlines()) <= 11 + notes and len(shown.splitlines()) <= 25
+        assert all(answer in said for answer in answers for said in (short, shown))
+        assert "< 3 GPU-days" in shown and "rejected scenes" in shown
+    assert "heuristic equals heuristic for" in short
     assert cli.run(["audit", run.storage.url]) == 0
     assert "add the run that made its scenes" in capsys.readouterr().out
     empty = make_run(tmp_path / "empty", n=50, shards=[])

@@ -17,6 +17,12 @@ from datagen.evaluation.methods import EvaluatedMethod
 from datagen.evaluation.report import Part, evaluation_report
 from datagen.evaluation.runs import candidate_sets_of, open_evaluated_runs
 from datagen.evaluation.score_files import ScoreFile
+from datagen.train.models import build_model
+from datagen.train.training.checkpoints import (
+    Checkpoint,
+    read_checkpoint,
+    write_checkpoint,
+)
 from tests.datagen.evaluation.conftest import SIDE, checkpoint
 from tests.datagen.evaluation.made_columns import make_columns
 from tests.datagen.html_report.page import Page
@@ -29,6 +35,9 @@ pytestmark = needs_sim
 SCENES = 6
 CELLS = SIDE * SIDE
 QUICK = ("--baselines", "none")
+PAPER_NETWORK = {
+    "n_points": 64, "centroids": [8, 4], "neighbours": [4, 4], "widths": [[4], [4], [8]], "head": [8],
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -115,12 +124,34 @@ def test_the_same_command_gives_the_same_numbers_as_json_and_as_tables(
     for report in (first, second):
         assert all(method.pop("seconds_per_600") > 0 for method in report["methods"])
     assert first == second
-    assert cli.run(words) == 0
+    assert cli.run([*words, "--full"]) == 0
     said = capsys.readouterr().out
     accuracy = first["parts"][0]["sets"]["clear"]["methods"]["c"]["accuracy"]
     assert f"{100 * accuracy['value']:.1f} [{100 * accuracy['low']:.1f}, " in said
     for line in ("Table I, in %:", "Table II:", "Table III:", "mAP", "commoner label", "arXiv:2509.11594"):
         assert line in said, line
+
+
+def test_a_terminal_gets_ten_lines_and_the_paper_speaks_of_its_own_network(
+    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The paper's figures belong to its baselines and to its network, not to every model of the same regime."""
+    ours, theirs = (checkpoint(tmp_path / f"{name}.pt", "sim-only") for name in ("ours", "theirs"))
+    torch.manual_seed(0)
+    network = build_model("paper", PAPER_NETWORK)
+    head = replace(read_checkpoint(theirs).head, model="paper", model_config=network.config)
+    write_checkpoint(Path(theirs), Checkpoint(head, dict(network.state_dict())))
+    words = ["evaluate", str(grids), ours, theirs, "--baselines", "proximity", "--baselines", "threshold"]
+    assert cli.run(words) == 0
+    short = capsys.readouterr().out
+    assert len(short.splitlines()) <= 10
+    assert cli.run([*words, "--full", "--out", str(tmp_path / "page.html")]) == 0
+    full = capsys.readouterr().out
+    assert len(full.splitlines()) > 3 * len(short.splitlines())
+    for said in (short, full):
+        rows = {line.split()[0]: line.split() for line in reversed(said.splitlines()) if line[:1].isalpha()}
+        assert rows["theirs"][-1] == "79.1" and rows["ours"][-1] == "-", said
+        assert rows["proximity"][-1] == "46.9"
 
 
 def test_houses_that_were_trained_on_are_refused_or_reported_separately(
