@@ -6,22 +6,13 @@ from dataclasses import asdict
 from pathlib import Path
 
 from cyclopts import App
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    DownloadColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeRemainingColumn,
-    TransferSpeedColumn,
-)
 
 from datagen.assets.catalogue import CATALOGUE, select
 from datagen.assets.fetch import Fetched, fetch, refuse_full_disk
 from datagen.assets.object_split import split_objects
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, size
+from datagen.display.progress import Progress, Seen
 from datagen.schemas.errors import InputError, choices
 from datagen.workers.content_cache import cache_folder
 
@@ -86,30 +77,20 @@ def fetch_assets(
         raise InputError("datagen assets fetch", "NAME", "is missing", fix)
     chosen = select(names)
     refuse_full_disk(chosen, out)
-    console = Console(stderr=True, quiet=json)
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        DownloadColumn(),
-        TransferSpeedColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        disable=json or not console.is_terminal,
-    )
     results: list[Fetched] = []
-    with bar:
+    with Progress(json) as shown:
         for asset in chosen:
-            task = bar.add_task(asset.name, total=asset.size)
+            seen = shown.counter(f"MB of {asset.name}")
 
-            def progress(here: int, total: int | None, task: TaskID = task) -> None:
-                bar.update(task, completed=here, total=total)
+            def progress(here: int, total: int | None, seen: Seen = seen) -> None:
+                seen(here // 10**6, (total or 0) // 10**6)
 
             done = fetch(asset, out, cache=cache_folder() / "downloads", mirror=mirror, progress=progress)
             results.append(done)
             how = "from the cache" if done.from_cache else "downloaded"
             trust = "digest as published" if done.trust == "published" else "trusted on first use"
             line = f"{done.name}: {how}, {size(done.size)}, {trust}, {done.files} files"
-            console.print(line, highlight=False)
+            shown.say("fetched", {"name": done.name, "bytes": done.size}, line)
     if json:
         print_json({"folder": str(out), "fetched": [asdict(result) for result in results]})
     return 0

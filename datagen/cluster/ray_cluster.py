@@ -132,14 +132,26 @@ def _refusal(address: str, error: BaseException) -> BaseException:
 
 
 def refuse_unusable(address: str) -> None:
-    """Raise InputError where no cluster responds, or it refuses the known token.
+    """Raise InputError where no cluster responds, it refuses the known token, or none can be started here.
 
-    `local` is always accepted. Ray itself would retry for minutes.
+    Ray itself would retry for minutes, and without a loopback network for ever.
     """
-    if address != "local":
+    if address == "local":
+        refuse_no_loopback()
+    else:
         address = _resolved(address)
         refuse_unreachable(address)
         token_for(address)
+
+
+def refuse_no_loopback() -> None:
+    """Raise InputError where processes of this machine cannot connect to each other."""
+    try:
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            socket.create_connection(server.getsockname(), timeout=_PATIENCE_S).close()
+    except OSError as error:
+        fix = "Start it with `ip link set lo up`, or work in this process: --workers 0"
+        raise InputError("--address", "local", f"the loopback network does not work ({error})", fix) from None
 
 
 def refuse_unreachable(address: str) -> None:

@@ -51,7 +51,7 @@ def cancel(
         if run is not None:
             problem = "--head concerns this machine and not a run"
             raise InputError("datagen cancel", run, problem, "Give one of the two")
-        return _cancel_head(now)
+        return _cancel_head(now, json)
     if run is None:
         raise InputError("datagen cancel", "RUN", "is missing", "Name a run, or give --head")
     storage = open_storage(run, probe=False, create=False)
@@ -115,7 +115,7 @@ def _stop_submission(job: StoredJob) -> None:
         _print_stderr(f"{job.id}: {error}")
 
 
-def _cancel_head(now: bool) -> int:
+def _cancel_head(now: bool, json: bool) -> int:
     head = running_head()
     if head is not None and not now:
         working = open_ray_jobs(head.jobs_api, head.token).at_work()
@@ -126,6 +126,9 @@ def _cancel_head(now: bool) -> int:
             )
     began_s = time.monotonic()
     ended = stop_head()
+    if json:
+        print_json({"stopped": ended})
+        return 0
     outcome = f"stopped after {seconds(time.monotonic() - began_s)}" if ended else "none runs for this user"
     print_rows("Ray for detached jobs", [("head", outcome)])
     return 0

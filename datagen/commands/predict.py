@@ -149,7 +149,7 @@ def predict(given: PredictOptions) -> Prediction:
     known from the pose, from --gravity and --camera-height, or from the image and --camera-height. Exit code
     1 when no cell was seen to be clear.
 
-    For example: datagen predict --base-height 0.4 --reach 0.85 --frame FRAME --out best.png
+    For example: datagen predict --base-height 0.7 --reach 0.85 --frame FRAME --out best.png
 
     Returns:
         All poses. `best` is the row of the best clear one (None where none was seen to be clear),

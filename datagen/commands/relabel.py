@@ -10,7 +10,7 @@ from typing import Literal
 
 from datagen.console.command_lines import command_line, print_interrupted
 from datagen.console.options import AsJson, RunPath
-from datagen.console.printing import counted, print_json, print_rows, seconds, summary_of_stored
+from datagen.console.printing import counted, new_labels, print_json, print_rows, seconds, summary_of_stored
 from datagen.relabelling import Relabelled, relabel_run, relabelled_specification
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
@@ -93,7 +93,7 @@ def _report(run: str, out: str, storage: Storage, done: Relabelled, elapsed_s: f
             print_json(report)
         else:
             rows = [
-                ("labels", f"{labels:,} new of {report['wanted']:,} wanted" if labels else "nothing to do"),
+                ("labels", new_labels(labels, done.run.n) if labels else "nothing to do"),
                 ("positive", f"{100 * positives / labels:.1f}%" if labels else "-"),
                 ("changed", f"{done.flips.to_good:,} labels became positive, {done.flips.to_bad:,} negative"),
                 ("time", seconds(elapsed_s)),

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 from datagen.console.command_lines import command_line
-from datagen.console.options import RunPath
+from datagen.console.options import AsJson, RunPath
 from datagen.console.printing import counted, listed, print_json, print_lines, print_rows
 from datagen.jobs.job_report import health_line, job_report
 from datagen.reports.events import events_of
@@ -17,12 +15,8 @@ from datagen.schemas.errors import printable
 from datagen.schemas.jobs import Jobs
 from datagen.schemas.storage import Storage, open_storage
 
-_JSON = Parameter(help="Print one JSON document to standard output; with --log, one object a line.")
 
-
-def status(
-    run: RunPath, /, *, log: bool = False, stacks: bool = False, json: Annotated[bool, _JSON] = False
-) -> int:
+def status(run: RunPath, /, *, log: bool = False, stacks: bool = False, json: AsJson = False) -> int:
     """Show the progress of a run: shards, labels, jobs, failed attempts by cause, and quarantine.
 
     For merged runs it shows the sums, and one line per part.
@@ -47,18 +41,18 @@ def status(
 
 def _print_log(storage: Storage, stacks: bool, as_json: bool) -> None:
     events = events_of(storage)
+    if as_json:
+        rows = [{"at": e.at, "event": e.what, "text": e.text, "shard": e.shard} for e in events]
+        if stacks:
+            rows = [r | ({"stack": e.stack} if e.stack else {}) for r, e in zip(rows, events, strict=True)]
+        print_json({"run": storage.url, "events": rows})
+        return
     if not events:
         sys.stderr.write("no events: no job has begun and no attempt has failed\n")
     for event in events:
-        stack = event.stack if stacks else ""
-        if as_json:
-            fields = {"at": event.at, "event": event.what, "text": event.text}
-            fields |= {"shard": event.shard} if event.shard is not None else {}
-            print_json(fields | ({"stack": stack} if stack else {}), indent=None)
-        else:
-            at = event.at[:23].replace("T", " ") or "unknown time"
-            print_lines(printable(f"{at}  {event.text}"))
-            print_lines(stack, "    ")
+        at = event.at[:23].replace("T", " ") or "unknown time"
+        print_lines(printable(f"{at}  {event.text}"))
+        print_lines(event.stack if stacks else "", "    ")
 
 
 def _print(name: str, storage: Storage, report: dict[str, Any]) -> None:
@@ -82,7 +76,7 @@ def _print(name: str, storage: Storage, report: dict[str, Any]) -> None:
     if report["attempts_without_end"]:
         without = counted(report["attempts_without_end"], "attempt")
         rows.insert(3, ("unfinished", f"{without}: running or lost"))
-    print_rows(f"run {name}", rows)
+    print_rows(name, rows)
     jobs = Jobs(storage).all()
     # The jobs that may be running, or else the latest.
     if shown := [job for job in jobs if job.health() in ("live", "silent")] or jobs[-1:]:

@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
-from typing import Any, TextIO
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -19,12 +19,12 @@ from rich.text import Text
 from datagen.schemas.errors import printable
 
 
-def print_json(value: Any, indent: int | None = 2, to: TextIO | None = None) -> None:
-    """Print one JSON document to a stream [standard output].
+def print_json(value: Any) -> None:
+    """Print one JSON document to standard output.
 
     ValueError, before any output, for values that JSON cannot hold.
     """
-    (to or sys.stdout).write(json.dumps(value, indent=indent, allow_nan=False) + "\n")
+    sys.stdout.write(json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def print_rows(title: str, rows: Sequence[Sequence[str]], heads: Sequence[str] = ()) -> None:
@@ -65,6 +65,13 @@ def summary_of_stored() -> Generator[None]:
         if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
             raise
         drop_output()
+
+
+def new_labels(made: int, wanted: int) -> str:
+    """The labels that a job made; a run's last shard may hold more than the store."""
+    if made > wanted:
+        return f"{made:,} new in whole shards; the store has the {wanted:,} wanted"
+    return f"{made:,} new of {wanted:,} wanted"
 
 
 def counted(n: int, what: str) -> str:

@@ -256,7 +256,7 @@ def notes(report: Report) -> list[tuple[str, str]]:
     if any(record["threshold"] is None for record in report["methods"]):
         found.append(("*", "has no threshold: its choice for each robot is positive, the rest negative"))
     found += [
-        (f"run {run['place']}", f"{part['label_source']} labels, split {part['split']}, {part['per_scene']} "
+        (run["place"], f"{part['label_source']} labels, split {part['split']}, {part['per_scene']} "
          f"{part['candidates']} candidates a scene, specification {part['spec_hash'][:12]}")
         for run in report["runs"] for part in run["parts"]
     ]  # fmt: skip

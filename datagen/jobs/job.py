@@ -75,7 +75,7 @@ class JobOptions:
             raise InputError("--workers", str(self.workers), "is not between 0 and 4096", fix)
         if self.workers != 0 or self.detach:
             refuse_missing("cluster", "" if self.detach else "or work in this process: --workers 0")
-        if self.workers != 0 and not self.detach:
+        if self.workers != 0 and (not self.detach or self.address == "local"):
             refuse_unusable(self.address)
 
     def display(self) -> Progress:

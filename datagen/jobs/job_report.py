@@ -12,6 +12,7 @@ from datagen.console.command_lines import command_line, print_interrupted
 from datagen.console.printing import (
     counted,
     listed,
+    new_labels,
     print_json,
     print_lines,
     print_rows,
@@ -136,7 +137,7 @@ def _print_dry_run(result: JobResult) -> None:
 def _print(result: JobResult) -> None:
     n, path = result.n, result.path
     if result.shards:
-        labels = f"{result.labels:,} new of {n:,} wanted"
+        labels = new_labels(result.labels, n)
     elif result.quarantined:
         labels = f"nothing to do: the shards of {n:,} labels are committed or quarantined"
     else:

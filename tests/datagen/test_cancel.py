@@ -65,7 +65,7 @@ def test_another_process_sees_and_stops_a_job(tmp_path: Path, capsys: pytest.Cap
     assert (shown["health"], shown["asked_to_stop"], shown["state"]["exit_code"]) == ("ended", "drain", 130)
     capsys.readouterr()
     assert cli.run(["status", str(run), "--log", "--json"]) == 0
-    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    events = json.loads(capsys.readouterr().out)["events"]
     assert [e["event"] for e in events] == ["job_began", "job_ended"]
     assert cli.run(["cancel", str(run)]) == 0
     assert "none is running" in capsys.readouterr().out

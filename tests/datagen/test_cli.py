@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import importlib
+import json as json_format
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +17,11 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from datagen import __version__, cli
+from datagen.console.options import JSON_HELP
+from datagen.released import CARD, FOLDER
 from datagen.schemas.errors import InputError
+from tests.conftest import REPOSITORY
+from tests.small_runs import PER_SCENE, arrays_of, submit_arguments
 
 
 class Box(BaseModel):
@@ -164,3 +170,69 @@ def test_closed_streams_are_quiet(words: str, closed: str, tmp_path: Path) -> No
     command = f"'{sys.executable}' -m datagen.cli {words} {errors} {closed}"
     done = subprocess.run(["bash", "-c", command], check=False, capture_output=True)
     assert (done.returncode, (tmp_path / "stderr").read_text()) == (0, "")
+
+
+HELPS = [
+    *([verb] for verb in sorted(cli.VERBS)), ["assets", "fetch"], ["assets", "list"], ["assets", "split"],
+    ["benchmark", "make"], ["benchmark", "score"],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("words", HELPS, ids=" ".join)
+def test_defaults_and_json_have_one_form_in_every_help(
+    words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "400")
+    assert cli.run([*words, "--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for line in lines:
+        for shown in re.findall(r"\[([^\]]+)\]", line.partition("Usage:")[0]):
+            assert re.match(r"default: |required$|choices: |,YAW$|heuristic$|OPTIONS$|ARGS$", shown), line
+    (json,) = [line for line in lines if re.search(r"--json\b", line)] or [JSON_HELP]
+    assert JSON_HELP in json
+
+
+def test_documents_have_that_form_of_defaults() -> None:
+    for page in sorted((REPOSITORY / "docs").rglob("*.md")):
+        for row in page.read_text().splitlines():
+            if row.startswith("|"):
+                assert not re.search(r" \[\w+\](?!\()", row), f"{page}: {row}"
+
+
+def test_the_example_of_predict_is_within_the_range_of_the_model(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["predict", "--help"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    (robots,) = [data["robots"] for data in json_format.loads((FOLDER / CARD).read_text())["data"]]
+    for option, field in (("--base-height", "base_height_m"), ("--reach", "arm_reach_m")):
+        value = re.search(rf"For example: datagen predict .*?{option} ([0-9.]+)", shown)
+        assert value is not None and robots[field][0] <= float(value[1]) <= robots[field][1], option
+
+
+def test_a_machine_without_loopback_is_refused_at_once(tmp_path: Path) -> None:
+    """Ray would wait for its own processes for ever."""
+    bare = ["unshare", "--user", "--map-root-user", "--net"]
+    if subprocess.run([*bare, "true"], check=False, capture_output=True).returncode:
+        pytest.skip("no namespaces here")
+    command = [*bare, sys.executable, "-m", "datagen.cli", *submit_arguments(tmp_path / "run", 8, workers=1)]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "loopback" in done.stderr and "ip link set lo up" in done.stderr and "--workers 0" in done.stderr
+
+
+@pytest.mark.parametrize("extra", [0, 4])
+def test_a_job_says_how_many_labels_it_made_and_how_many_the_store_has(
+    extra: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    n = 2 * PER_SCENE - extra
+    assert cli.run([*submit_arguments(tmp_path / "run", n), "--json"]) == 0
+    result = json_format.loads(capsys.readouterr().out)
+    assert (result["end"], result["labels"], result["n"]) == ("complete", 2 * PER_SCENE, n)
+    assert result["run"] == str(tmp_path / "run") and result["store"].endswith("data.zarr")
+    assert cli.run(submit_arguments(tmp_path / "other", n)) == 0
+    shown = capsys.readouterr().out
+    stored = arrays_of(tmp_path / "other")["label"].shape[0]
+    assert stored == n
+    wanted = "16 new in whole shards; the store has the 12 wanted" if extra else "16 new of 16 wanted"
+    assert wanted in shown
+    assert cli.run(["status", str(tmp_path / "run")]) == 0
+    assert "run run" not in capsys.readouterr().out.replace(str(tmp_path) + "/", "")

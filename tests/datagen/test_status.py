@@ -49,7 +49,7 @@ def troubled(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def lines_of(capture: pytest.CaptureFixture[str], *arguments: str) -> list[Any]:
     capture.readouterr()
     assert cli.run(["status", *arguments, "--log", "--json"]) == 0
-    return [json.loads(line) for line in capture.readouterr().out.splitlines()]
+    return json.loads(capture.readouterr().out)["events"]
 
 
 def test_log_lists_failures_and_retries_in_order_of_time(

@@ -20,7 +20,7 @@ from datagen.workers.json_document import JsonNode, parse_json
 MAX_SIDE_PX = 8192
 MAX_PIXELS = 4096 * 4096
 MAX_FILE_BYTES = 256 * 2**20
-FILE_FIX = "Name an existing, smaller file"
+FILE_FIX = "Name a readable file of at most 256 MiB"
 _MAX_JSON_BYTES = 2**20
 # The largest entry of R R^T - I: poses are often text of four or five digits.
 _POSE_ROUNDING = 1e-3
@@ -152,7 +152,9 @@ def _array(path: Path, name: str, data: bytes) -> Array:
 
 
 def _document(path: Path) -> JsonNode:
-    return parse_json(read_regular(path, _MAX_JSON_BYTES, FILE_FIX), str(path))
+    return parse_json(
+        read_regular(path, _MAX_JSON_BYTES, "Name a readable JSON file of at most 1 MiB"), str(path)
+    )
 
 
 def _opened(path: Path, formats: tuple[str, ...], mode: str | None) -> Image.Image:

@@ -138,6 +138,10 @@ def read_place(place: str | Path, depth_scale_m: float = DEPTH_SCALE_M) -> Senso
         case _ if path.is_dir():
             more = [path / name if (path / name).exists() else None for name in (MASK, POSE)]
             files = (path / RGB, path / DEPTH, path / INTRINSICS)
+            for file in files:
+                if not file.exists():
+                    fix = f"A frame's folder has {RGB}, {DEPTH} and {INTRINSICS}"
+                    raise InputError(file, "", "is missing", fix)
             return read_frame(*files, mask=more[0], pose=more[1], depth_scale_m=depth_scale_m)
         case _:
             fix = f"Name a folder with {RGB}, {DEPTH} and {INTRINSICS}, an .npz archive or a .ply cloud"

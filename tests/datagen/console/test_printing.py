@@ -15,8 +15,8 @@ def test_a_value_without_a_place_in_json_prints_nothing(capsys: pytest.CaptureFi
     with pytest.raises(ValueError, match="JSON"):
         print_json({"good": [1, 2, 3], "bad": float("nan")})
     assert capsys.readouterr().out == ""
-    print_json({"text": "\ud800"}, indent=None)
-    assert capsys.readouterr().out == '{"text": "\\ud800"}\n'
+    print_json({"text": "\ud800"})
+    assert capsys.readouterr().out == '{\n  "text": "\\ud800"\n}\n'
 
 
 def test_no_other_module_prints_json_to_standard_output() -> None:

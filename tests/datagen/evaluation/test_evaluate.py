@@ -135,7 +135,7 @@ def test_the_same_command_gives_the_same_numbers_as_json_and_as_tables(
 def test_a_terminal_gets_ten_lines_and_the_paper_speaks_of_its_own_network(
     grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The paper's figures belong to its baselines and to its network, not to every model of the same regime."""
+    """The paper's figures are of its baselines and its network, not of every model of the same regime."""
     ours, theirs = (checkpoint(tmp_path / f"{name}.pt", "sim-only") for name in ("ours", "theirs"))
     torch.manual_seed(0)
     network = build_model("paper", PAPER_NETWORK)
