@@ -8,7 +8,7 @@ BIN := .venv/bin
 TYPES := $(BIN)/pyright --pythonpath $(BIN)/python
 DEMO := build/demo
 
-.PHONY: help demo paper-small paper model test slow faults lint style types format docs site venv venv-labels clean
+.PHONY: help pictures demo paper-small paper model test slow faults lint style types format docs site venv venv-labels clean
 .DEFAULT_GOAL := help
 
 help:
@@ -22,6 +22,7 @@ help:
 	@echo "make lint    the same without tests"
 	@echo "make format  rewrite the code in the project's format"
 	@echo "make docs    rewrite the pages of docs/reference that follow from the schemas"
+	@echo "make pictures  draw the pictures of the documents again"
 	@echo "make site    the documents as a site with search (in build/site); dead links fail"
 	@echo "make venv    only the environment (.venv); PYTHON=python3.12 chooses another interpreter"
 	@echo "make clean   remove everything that make made"
@@ -100,6 +101,9 @@ docs: venv
 	mv build/data-format.md docs/reference/data-format.md
 	$(BIN)/python -m scripts.specification_page > build/specification.md
 	mv build/specification.md docs/reference/specification.md
+
+pictures: venv
+	$(BIN)/python -m scripts.pictures
 
 # Fails at dead links and at names that are not there. NO_MKDOCS_2_WARNING: an announcement of the theme's authors.
 site: venv

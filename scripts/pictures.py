@@ -1,0 +1,55 @@
+"""Make the pictures of the documents, on the built-in world.
+
+    python -m scripts.pictures [FOLDER]        (make pictures; FOLDER is docs/images)
+
+A test makes each of them again and compares it with the one that is kept.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+from datagen import cli
+
+IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
+GRID = ("--candidates-per-scene", "grid")
+NEAR = ("--candidates", "in-range")
+# The commands of each picture, in a folder of its own; `make demo` makes the first.
+PICTURES: dict[str, list[tuple[str, ...]]] = {
+    "labels.png": [
+        ("submit", "heuristic", "--n", "600", *NEAR, "--out", "run"),
+        ("show", "run", "--scene", "9", "--out", "labels.png"),
+    ],
+    "outcomes.png": [
+        ("submit", "plan", "--n", "1875", *GRID, "--out", "run"),
+        ("show", "run", "--scene", "2", "--out", "outcomes.png"),
+    ],
+    "trial.png": [
+        ("submit", "sim", "--n", "120", *NEAR, "--out", "run"),
+        ("show", "run", "--scene", "1", "--trial", "best", "--out", "trial.png"),
+    ],
+    "predict.png": [("predict", "--demo", "--out", "predict.png", "--html", "page.html")],
+}
+
+
+def make(name: str, out: Path) -> None:
+    """Make one picture and write it to `out`. RuntimeError where a command fails."""
+    before = Path.cwd()
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        try:
+            for words in PICTURES[name]:
+                if cli.run([*words, *(("--workers", "0") if words[0] == "submit" else ())]):
+                    raise RuntimeError(f"datagen {' '.join(words)}: failed")
+            out.write_bytes(Path(name).read_bytes())
+        finally:
+            os.chdir(before)
+
+
+if __name__ == "__main__":
+    target = Path(sys.argv[1] if len(sys.argv) > 1 else IMAGES).resolve()
+    for picture in PICTURES:
+        make(picture, target / picture)
