@@ -13,7 +13,7 @@ DEMO := build/demo
 
 help:
 	@echo "make demo    600 labels on the built-in world, a picture and the next command (in $(DEMO))"
-	@echo "make paper-small  labels, training and tables on real houses, small (DATAGEN_ASSETS; in build/paper-small)"
+	@echo "make paper-small  labels, our network and the paper's, and tables on real houses, small (DATAGEN_ASSETS)"
 	@echo "make paper   the same with as many labels as the paper has (in build/paper)"
 	@echo "make model   the released model, its benchmark and its closed loop (in build/model)"
 	@echo "make test    format check, lint, types, layers, tests"

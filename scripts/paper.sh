@@ -93,14 +93,14 @@ datagen relabel "$OUT/runs/heuristic" --config "$OUT/rule.toml" --out "$OUT/runs
 #    project's own, `shared`, not the paper's.
 TRAIN_SIM=("$OUT/runs/train-in-range" "$OUT/runs/train-clear")
 VAL_SIM=(--val "$OUT/runs/val-in-range" --val "$OUT/runs/val-clear")
-step "stage 1, our network"
+step "our network: stage 1"
 datagen train stage1 "$OUT/runs/calibrated" --out "$OUT/models/stage1.ckpt" --epochs "$EPOCHS_1"
 # on_trials NAME SHARE: both trainings that learn from trials, from those in a share of the houses.
 on_trials() {
     local sim=("${TRAIN_SIM[@]}" "${VAL_SIM[@]}" --house-share "$2" --epochs "$EPOCHS_2")
-    step "sim only $1, our network"
+    step "our network: sim only$1"
     datagen train sim-only "${sim[@]}" --out "$OUT/models/sim-only$1.ckpt"
-    step "stage 2 $1, our network"
+    step "our network: stage 2$1"
     datagen train stage2 "${sim[@]}" --out "$OUT/models/stage2$1.ckpt" --init "$OUT/models/stage1.ckpt"
 }
 on_trials "" 1
@@ -121,11 +121,11 @@ SIZES
 fi
 PAPER=(--model paper --model-config "$PAPER_NETWORK")
 WHOLE=("${TRAIN_SIM[@]}" "${VAL_SIM[@]}" --epochs "$EPOCHS_2")
-step "stage 1, the paper's network"
+step "the paper's network: stage 1"
 datagen train stage1 "$OUT/runs/calibrated" --out "$OUT/models/paper-stage1.ckpt" --epochs "$EPOCHS_1" "${PAPER[@]}"
-step "sim only, the paper's network"
+step "the paper's network: sim only"
 datagen train sim-only "${WHOLE[@]}" --out "$OUT/models/paper-sim-only.ckpt" "${PAPER[@]}"
-step "stage 2, the paper's network"
+step "the paper's network: stage 2"
 datagen train stage2 "${WHOLE[@]}" --out "$OUT/models/paper-stage2.ckpt" --init "$OUT/models/paper-stage1.ckpt"
 
 # 5. Tables I to III, in houses and on objects that no model and no baseline has seen.

@@ -15,9 +15,7 @@ from tests.sim_extra import needs_sim
 
 # Those that need planning or physics take longer than a test of every change may.
 SLOW = {"outcomes.png", "trial.png"}
-NAMES = [
-    pytest.param(name, marks=[needs_sim, pytest.mark.slow] if name in SLOW else []) for name in PICTURES
-]
+NAMES = [pytest.param(name, marks=[needs_sim, pytest.mark.slow] if name in SLOW else []) for name in PICTURES]
 
 
 @pytest.mark.parametrize("name", NAMES)
