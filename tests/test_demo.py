@@ -1,4 +1,4 @@
-"""`make demo`: its commands are ours, its first picture makes sense, and it ends with what to look at and to type."""
+"""`make demo`: its commands are ours, its picture makes sense, and it ends with that and the next command."""
 
 from __future__ import annotations
 
