@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from datagen import cli
 from datagen.evaluation.methods import EvaluatedMethod
