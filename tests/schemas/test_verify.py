@@ -1,40 +1,54 @@
-"""What checks find among the records of a run, and that they find nothing in a sound one."""
+"""Checks find every damaged byte and name its file and the fix, and find nothing in sound runs."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from datagen.schemas.checking.finding import Restore, SetAside
-from datagen.schemas.checking.repair import repair_runs
+from datagen.schemas.checking.finding import Finding, Restore, SetAside
 from datagen.schemas.errors import InputError
+from datagen.schemas.fields import RecordSchema
+from datagen.schemas.jobs import JobRecord, Jobs, JobState, new_job_id
+from datagen.schemas.quarantine import lift_quarantine
 from datagen.schemas.record_files import (
     MERGED,
-    commit_copy_key,
     commit_key,
+    decode_record,
     encode_record,
-    part_folder,
+    lost_end,
     signed_json,
+    utc_now,
 )
-from datagen.schemas.run import Run
-from datagen.schemas.run_records import Cost, Merged, Plan, QuarantineRecord
-from datagen.schemas.sealing import seal
+from datagen.schemas.run import Run, open_runs
+from datagen.schemas.run_records import AttemptStart, Cost, LedgerEntry, Plan, QuarantineRecord, ShardRanges
+from datagen.schemas.sealing import store_record
+from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.storage import open_storage
-from tests.faults.damage_campaign import fewer_arrays
-from tests.made_runs import attempt, make_run, small_spec
-from tests.schemas.checked import check, edit, folder_of, found, sealed_run
+from tests.made_runs import attempt, files_of, make_run, rows_of
+from tests.schemas.checked import (
+    check,
+    commit_object,
+    edit,
+    encoded,
+    fill,
+    folder_of,
+    found,
+    merge,
+    sealed_run,
+)
 
-
-@pytest.fixture(scope="module", autouse=True)
-def quick() -> Iterator[None]:
-    """Runs of few files."""
-    with fewer_arrays():
-        yield
+pytestmark = pytest.mark.usefixtures("few_arrays")
+COST = Cost(wall_s=3.0, cpu_s=2.0)
+QUARANTINED = QuarantineRecord(
+    shard=3, seed=0, first_scene=6, scenes=2, attempts=(), causes=(), stacks=(), created=""
+)
 
 
 @pytest.fixture
@@ -42,294 +56,377 @@ def sealed(tmp_path: Path) -> Run:
     return sealed_run(tmp_path / "run")
 
 
-def test_a_sound_run_has_no_findings_and_its_numbers_are_told(sealed: Run):
+@pytest.fixture
+def merged(tmp_path: Path) -> Path:
+    """Merged runs of two specifications, one of them in shards of two sizes."""
+    for who, size, seed, shards in (("a", 2, 1, [0, 1]), ("b", 3, 1, [0]), ("c", 2, 2, [0, 1])):
+        fill(tmp_path, who, shards, 20, size, seed)
+    merge(tmp_path, "abc", "merged")
+    return tmp_path / "merged"
+
+
+def only(run: Run) -> Finding:
+    (finding,), _ = check(folder_of(run))
+    return finding
+
+
+def restored(finding: Finding, model: type[Any]) -> Any:
+    assert isinstance(finding.cure, Restore)
+    return decode_record(finding.key, finding.cure.data, model)
+
+
+# Every byte ----------------------------------------------------------------------------------
+
+
+def damages(data: bytes, rng: np.random.Generator) -> dict[str, bytes | None]:
+    """A file removed, emptied, cut, with a byte more, and with one bit changed at several places."""
+    changed: dict[str, bytes | None] = {
+        "removed": None,
+        "emptied": b"",
+        "cut": data[:-1],
+        "longer": data + b"\0",
+    }
+    for at in {0, len(data) - 1, *rng.integers(0, len(data), 4).tolist()}:
+        changed[f"bit in byte {at}"] = (
+            data[:at] + bytes([data[at] ^ 1 << int(rng.integers(8))]) + data[at + 1 :]
+        )
+    return changed
+
+
+@pytest.mark.parametrize("kind", ["run", "merged"])
+def test_every_damaged_file_is_found_and_named_with_its_fix(kind: str, sealed: Run, merged: Path) -> None:
+    folder, rng = (folder_of(sealed) if kind == "run" else merged), np.random.default_rng(7)
+    if kind == "run":
+        sealed.grow(40)
+        sealed.quarantine(QUARANTINED)
+        attempt(sealed, 2, "a-2")
+    is_stale = found(folder)
+    record = store_record(open_storage(folder))
+    assert record is not None
+    held = {
+        str((folder_of(run) / commit_key(shard)).relative_to(folder))
+        for run, part in zip(open_runs(folder), record.parts, strict=True)
+        for shard in run.planned(part.n).without(ShardRanges.between(part.missing))
+    }
+    names = [key for key in files_of(folder) if not key.endswith(".claim")]
+    assert {key.split("/")[0] for key in names} >= {"data.json", "data.zarr"}
+    for key in names:
+        path = folder / key
+        whole = path.read_bytes()
+        for what, data in damages(whole, rng).items():
+            path.unlink() if data is None else path.write_bytes(data)
+            findings = [f for f in check(folder)[0] if f.is_damage]
+            if data is None and "quarantine/" in key:
+                assert findings == []  # as if it was released
+            elif data is None and "commits/" in key:
+                # A shard without rows in the store is only made again.
+                assert [(f.kind, f.key) for f in findings] == [("lost", "data.json")] * (key in held), key
+                assert all("datagen resume" in f.fix for f in findings)
+            else:
+                named = [f for f in findings if f.key == key]
+                assert named and all(f.problem and f.fix for f in named), (key, what, findings)
+        path.write_bytes(whole)
+    assert found(folder) == is_stale
+
+
+def test_sound_runs_have_no_findings_and_their_numbers_are_reported(
+    sealed: Run, merged: Path, tmp_path: Path
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
     findings, checked = check(folder_of(sealed))
-    assert findings == []
-    assert (checked.shards, checked.samples, checked.is_sealed) == (2, 20, True)
-    assert checked.files == sum(len(c.files) for c in sealed.commits())
+    assert (findings, checked.shards, checked.samples, checked.is_sealed) == ([], 2, 20, True)
+    assert checked.bytes == sum(commit.object.size for commit in sealed.commits())
     totals = checked.totals
     assert (totals.attempts, totals.committed_wall_s, totals.wasted_wall_s) == (3, 2.0, 2.0)
-
-
-def test_unfinished_unsealed_and_empty_runs_are_sound(tmp_path: Path):
-    run = make_run(tmp_path / "a", 50, shards=[0, 3])
+    findings, checked = check(merged)
+    assert (findings, checked.shards, checked.is_sealed) == ([], 5, True)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before  # nothing is written
+    run = make_run(tmp_path / "unfinished", 50, shards=[0, 3])
     run.ledger.start("runs-now", 1)
-    assert found(tmp_path / "a") == []
-    assert check(tmp_path / "a")[1].totals.unfinished == 1
-    make_run(tmp_path / "b", 50, shards=[])
-    assert found(tmp_path / "b") == []
+    findings, checked = check(tmp_path / "unfinished")
+    assert (findings, checked.totals.unfinished) == ([], 1)
+    make_run(tmp_path / "empty", 50, shards=[])
+    assert found(tmp_path / "empty") == []
 
 
-def test_what_is_no_run_is_refused(tmp_path: Path):
+def test_places_without_a_run_and_other_formats_are_refused(sealed: Run, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not a run"):
         check(tmp_path)
-    run = make_run(tmp_path / "run", 10)
     for key in ("manifest.json", "copies/manifest.json"):
-        edit(folder_of(run) / key, format_version=99)
+        edit(folder_of(sealed) / key, format_version=99)
     with pytest.raises(InputError, match="99"):
-        check(folder_of(run))
+        check(folder_of(sealed))
 
 
-def test_a_seal_that_is_behind_is_told_and_is_no_damage(sealed: Run):
-    sealed.grow(40)
-    findings, _ = check(folder_of(sealed))
-    assert [(f.kind, f.is_damage) for f in findings] == [("stale", False)]
-    attempt(sealed, 2, "a-2")
-    assert found(folder_of(sealed)) == [("stale", "data.zarr")]
+# Root records --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("key", ["manifest.json", "plans/1.json"])
 @pytest.mark.parametrize("copies", ["", "copies/"])
-def test_root_records_and_their_copies_restore_each_other(sealed: Run, key: str, copies: str):
+def test_root_records_and_their_copies_restore_each_other(sealed: Run, key: str, copies: str) -> None:
     path = folder_of(sealed) / f"{copies}{key}"
     whole = path.read_bytes()
-    for damage in (path.unlink, lambda: path.write_bytes(whole[:-1]), lambda: path.write_bytes(b"")):
-        damage()
-        (finding,), _ = check(folder_of(sealed))
+    for data in (None, whole[:-1], b""):
+        path.unlink() if data is None else path.write_bytes(data)
+        finding = only(sealed)
         assert (finding.kind, finding.key, finding.cure) == ("record", f"{copies}{key}", Restore(whole))
         path.write_bytes(whole)
 
 
-def test_records_that_are_signed_but_differ_from_their_copies_are_found(sealed: Run):
+def test_signed_records_that_differ_from_their_copies_or_in_form_are_found(sealed: Run) -> None:
     folder = folder_of(sealed)
     edit(folder / "manifest.json", code_version="9")
     edit(folder / "plans/1.json", created="now")
-    edit(folder / commit_key(1), created="now")
-    expected = [("record", "manifest.json"), ("record", "plans/1.json"), ("record", commit_key(1))]
-    findings, _ = check(folder)
-    assert [(f.kind, f.key) for f in findings if f.kind == "record"] == expected
-    assert all(f.cure is None for f in findings if f.kind == "record")
-
-
-def test_records_that_are_signed_but_laid_out_otherwise_are_found(sealed: Run):
-    path = folder_of(sealed) / "ledger/x-1.json"
+    path = folder / "ledger/x-1.json"
     record = json.loads(path.read_text())
     del record["sha256"]
     path.write_bytes(signed_json(dict(reversed(record.items()))))
-    assert found(folder_of(sealed)) == [("account", "ledger/x-1.json")]
+    findings, _ = check(folder)
+    assert [(f.kind, f.key) for f in findings] == [
+        ("record", "manifest.json"), ("record", "plans/1.json"), ("account", "ledger/x-1.json"),
+    ]  # fmt: skip
+    assert [f.cure is None for f in findings] == [True, True, False]
 
 
-def test_plans_that_are_gone_or_shrink(tmp_path: Path):
+def test_plans_that_are_gone_or_shrink(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", 10)
     run.grow(20)
     run.grow(30)
-    folder = folder_of(run)
-    for key in ("plans/2.json", "copies/plans/2.json"):
+    folder, both = folder_of(run), ("plans/2.json", "copies/plans/2.json")
+    for key in both:
         (folder / key).unlink()
     assert found(folder) == [("record", "plans/2.json")]
-    for key in ("plans/2.json", "copies/plans/2.json"):
+    for key in both:
         (folder / key).write_bytes((folder / "plans/1.json").read_bytes())
-    assert found(folder) == [("record", "plans/2.json"), ("record", "copies/plans/2.json")]
+    assert found(folder) == [("record", key) for key in both]
     shrunk = Plan(n=10, created="", spec_hash=run.manifest.spec_hash, number=2)
-    for key in ("plans/2.json", "copies/plans/2.json"):
+    for key in both:
         (folder / key).write_bytes(encode_record(shrunk))
     assert found(folder) == [("record", "plans/2.json")]
 
 
-# Commits -----------------------------------------------------------------------------------------
+def test_merged_runs_are_restored_from_the_copy_and_miss_a_part(merged: Path) -> None:
+    whole = (merged / MERGED).read_bytes()
+    (merged / MERGED).unlink()
+    (finding,), _ = check(merged)
+    assert (finding.key, finding.cure) == (MERGED, Restore(whole))
+    (merged / MERGED).write_bytes(whole)
+    part = min((merged / "parts").iterdir())
+    shutil.rmtree(part)
+    assert ("record", f"parts/{part.name}/manifest.json") in found(merged) and not part.exists()
 
 
-def test_a_deleted_commit_is_known_from_the_sealed_store_or_the_ledger(sealed: Run):
-    folder = folder_of(sealed)
-    whole = (folder / commit_key(1)).read_bytes()
-    (folder / commit_key(1)).unlink()
-    (finding,), _ = check(folder)
-    assert (finding.key, finding.cure) == (commit_key(1), Restore(whole))
-    shutil.rmtree(folder / "data.zarr")
-    (finding,), _ = check(folder)
-    assert (finding.key, finding.cure) == (commit_key(1), Restore(whole))
+def test_a_torn_state_of_a_job_is_no_finding_and_a_damaged_job_is(sealed: Run) -> None:
+    jobs, job = Jobs(sealed.storage), new_job_id()
+    jobs.begin(JobRecord(id=job, command=(), host="h", pid=1, started=utc_now(), address="local"))
+    jobs.put_state(JobState(id=job, updated=utc_now(), phase="making"))
+    jobs.ask_to_stop(job, at_once=True)
+    state = folder_of(sealed) / f"jobs/{job}.state.json"
+    for data in (state.read_bytes()[:-1], b"", b"\0" * 100):
+        state.write_bytes(data)
+        assert found(folder_of(sealed)) == []
+    (folder_of(sealed) / f"jobs/{job}.json").write_bytes(b"{}")
+    assert found(folder_of(sealed)) == [("record", f"jobs/{job}.json")]
 
 
-def test_a_commit_that_is_gone_with_its_copy_leaves_an_open_shard(sealed: Run):
-    folder = folder_of(sealed)
-    shutil.rmtree(folder / "data.zarr")
-    for key in (commit_key(1), commit_copy_key(1, "a-1")):
-        (folder / key).unlink()
-    (finding,), _ = check(folder)
-    assert (finding.kind, finding.key) == ("lost", commit_key(1)) and isinstance(finding.cure, SetAside)
-    attempt(sealed, 1, "again")
-    assert found(folder) == []
-
-
-def test_of_several_copies_the_one_that_the_ledger_names_counts(sealed: Run):
-    folder = folder_of(sealed)
-    right = (folder / commit_key(1)).read_bytes()
-    loser = sealed.commit_of(1).model_copy(update={"attempt": "x-1"})
-    (folder / "shards/000001/x-1").mkdir()
-    (folder / commit_copy_key(1, "x-1")).write_bytes(encode_record(loser))
-    assert found(folder) == []  # what a killed loser leaves
-    (folder / commit_key(1)).write_bytes(right[:-9])
-    (finding,), _ = check(folder)
-    assert (finding.key, finding.cure) == (commit_key(1), Restore(right))
+# Commits, objects and stores -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "changes", [{"shard": 0}, {"spec_hash": "0" * 64}, {"scenes": 1}, {"samples": 3}, {"format_version": "x"}]
 )
-def test_a_commit_that_cannot_be_this_shards_gives_way_to_its_copy(sealed: Run, changes: dict[str, Any]):
+def test_a_commit_that_cannot_be_this_shards_is_set_aside(sealed: Run, changes: dict[str, Any]) -> None:
+    edit(folder_of(sealed) / commit_key(1), **changes)
+    finding = next(f for f in check(folder_of(sealed))[0] if f.kind == "record")
+    assert (finding.key, finding.shard) == (commit_key(1), 1) and isinstance(finding.cure, SetAside)
+
+
+def test_files_that_no_record_names_are_foreign_or_of_the_store(sealed: Run) -> None:
     folder = folder_of(sealed)
-    whole = (folder / commit_key(1)).read_bytes()
-    edit(folder / commit_key(1), **changes)
-    (finding,), _ = check(folder)
-    assert (finding.key, finding.cure) == (commit_key(1), Restore(whole))
+    sealed.storage.put("shards/superseded.zip", b"of an attempt that did not commit")
+    sealed.storage.put("ledger/a-2.json.part", b"left by a killed writer")
+    assert found(folder) == []
+    for kind, keys in {
+        "foreign": ("shards/notes.txt", "shards/000001/a-1/c.0", "ledger/notes.txt", "ledger/old/a-2.json"),
+        "sealed": ("data.zarr/label/c.9", "data.zarr/other/c.0", "data.zarr/README"),
+    }.items():
+        for key in keys:
+            sealed.storage.put(key, b"")
+            assert found(folder) == [(kind, key)]
+            sealed.storage.delete([key])
 
 
-# Ledger ------------------------------------------------------------------------------------------
+def test_a_store_that_is_outdated_is_no_damage_and_lost_commits_of_it_are(sealed: Run) -> None:
+    sealed.grow(40)
+    findings, _ = check(folder_of(sealed))
+    assert [(f.kind, f.key, f.is_damage) for f in findings] == [("stale", "data.zarr", False)]
+    attempt(sealed, 2, "a-2")
+    assert found(folder_of(sealed)) == [("stale", "data.zarr")]
+    for shard in (0, 1, 2):
+        (folder_of(sealed) / commit_key(shard)).unlink()
+        assert ("lost", "data.json") in found(folder_of(sealed))
+    assert attempt(sealed, 0, "again-0") and attempt(sealed, 1, "again-1")
+    assert "lost" not in dict(found(folder_of(sealed)))
 
 
-def test_ends_and_starts_of_committed_attempts_come_from_their_commits(sealed: Run):
-    folder = folder_of(sealed)
-    start, end = folder / "ledger/a-0.start.json", folder / "ledger/a-0.json"
-    for path in (start, end):
-        whole = path.read_bytes()
-        path.unlink()
-        (finding,), _ = check(folder)
-        assert finding.kind == "account" and isinstance(finding.cure, Restore)
-        path.write_bytes(finding.cure.data)
-        assert found(folder) == []
-        path.write_bytes(whole)
+def test_a_record_of_a_store_that_states_other_things_is_found(sealed: Run) -> None:
+    path = folder_of(sealed) / "data.json"
+    whole = json.loads(path.read_text())
+    part = whole["parts"][0]
+    for changes in (
+        {"rows_sha256": "0" * 64},
+        {"parts": [part | {"n": 18}]},
+        {"parts": [part | {"missing": [[0, 1]]}]},
+    ):
+        edit(path, **changes)
+        assert found(folder_of(sealed)) == [("stale", "data.zarr")]
+    edit(path, parts=[part | {"n": 10**12}])
+    assert found(folder_of(sealed)) == [("lost", "data.json")]  # shards that were never made
+    edit(path, **{name: whole[name] for name in ("parts", "rows_sha256")}, files=whole["files"][:-1])
+    assert [kind for kind, _ in found(folder_of(sealed))] == ["sealed"]
 
 
-def test_an_account_that_is_not_its_commits(sealed: Run):
-    folder = folder_of(sealed)
-    edit(folder / "ledger/a-0.json", outcome="failed")
-    assert found(folder) == [("account", "ledger/a-0.json")]
-    edit(folder / "ledger/a-0.json", outcome="committed", cost={"wall_s": 9, "cpu_s": 1})
-    assert ("account", "ledger/a-0.json") in found(folder)
+# Rows ----------------------------------------------------------------------------------------
 
 
-def test_an_end_without_a_start_and_a_start_of_a_decided_shard_without_an_end(sealed: Run):
+def _move(tables: Any, name: str, at: Any, step: Any) -> None:
+    tables[name in tables[1]][name][at] += step
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("scene_index", lambda t: _move(t, "scene_index", slice(None), 1)),
+        ("sample_id", lambda t: t[1]["sample_id"].__setitem__((3, 5), t[1]["sample_id"][3, 5] ^ 1)),
+        ("candidate_index", lambda t: _move(t, "candidate_index", 1, -1)),
+        ("sample_scene_index", lambda t: _move(t, "sample_scene_index", -1, -1)),
+        ("label", lambda t: t[1]["label"].__setitem__(0, 2)),
+        ("label", lambda t: t[1]["label"].__setitem__(0, t[1]["label"][0] ^ 1)),
+        ("redraws", lambda t: _move(t, "redraws", (0, 0), 1)),
+        ("distance_m", lambda t: t[1]["distance_m"].__setitem__(0, -1.0)),
+        ("distance_m", lambda t: t[1]["distance_m"].__setitem__(0, np.nan)),
+        ("points_m", lambda t: t[0]["points_m"].__setitem__((0, 0, 0), np.inf)),
+    ],
+)
+def test_rows_that_are_not_those_of_their_place_or_out_of_range_are_found(
+    tmp_path: Path, name: str, change: Callable[[Any], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every digest is right: a writer without our checks made and committed them."""
+    run = make_run(tmp_path / "run", 20, shards=[0])
+    tables = rows_of(run, 1)
+    change(tables)
+    with monkeypatch.context() as patch:
+        patch.setattr(RecordSchema, "check", lambda *a: None)
+        commit_object(run, 1, encoded(run, tables))
+    assert found(folder_of(run)) == [("rows", f"shards/f.zip/{name}")]
+
+
+def test_sums_in_a_commit_that_its_rows_do_not_have_and_arrays_of_other_types(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", 20)
+    positives = run.commit_of(1).positives + 1
+    edit(folder_of(run) / commit_key(1), positives=positives, redraws={"fell_off": 3})
+    assert found(folder_of(run)) == [("rows", "shards/a-1.zip/label"), ("rows", "shards/a-1.zip/redraws")]
+    run = make_run(tmp_path / "other", 20, shards=[0])
+    samples = tuple(
+        replace(f, dtype="float64") if f.name == "distance_m" else f for f in run.schema.sample_fields
+    )
+    tables = rows_of(run, 1)
+    tables[1]["distance_m"] = tables[1]["distance_m"].astype("float64")
+    other = replace(run.schema, sample_fields=samples)
+    commit_object(run, 1, encode_shard(other, run.layout, run.manifest.spec_hash, *tables))
+    prefix = "shards/f.zip/distance_m"
+    assert found(folder_of(run)) == [("rows", f"{prefix}/zarr.json"), ("rows", prefix)]
+
+
+# Ledger and quarantine -----------------------------------------------------------------------
+
+
+def test_starts_of_committed_attempts_follow_from_commits_and_their_ends_do_not_belong(sealed: Run) -> None:
+    for key, changes in (
+        ("ledger/a-0.start.json", {"shard": 1}),
+        ("ledger/a-0.start.json", {"attempt": "x"}),
+    ):
+        edit(folder_of(sealed) / key, **changes)
+        finding = only(sealed)
+        assert (finding.kind, finding.key, finding.shard) == ("account", key, 0)
+        assert restored(finding, AttemptStart) == AttemptStart(attempt="a-0", shard=0, started="")
+        sealed.storage.put(key, encode_record(AttemptStart(attempt="a-0", shard=0, started="")))
+    sealed.ledger.end(LedgerEntry(attempt="a-0", shard=0, outcome="failed"))
+    finding = only(sealed)
+    assert (finding.key, finding.cure) == ("ledger/a-0.json", SetAside())
+
+
+def test_starts_follow_from_ends_and_records_of_others_are_not_overwritten(sealed: Run) -> None:
     folder = folder_of(sealed)
     (folder / "ledger/x-1.start.json").unlink()
-    (finding,), _ = check(folder)
-    assert (finding.key, finding.kind) == ("ledger/x-1.start.json", "account")
-    assert finding.cure is not None
-    sealed.ledger.start("x-1", 1)
+    assert restored(only(sealed), AttemptStart) == AttemptStart(attempt="x-1", shard=1, started="")
+    (folder / "ledger/x-1.json").write_bytes(b"{}")
+    finding = only(sealed)
+    assert (finding.kind, finding.key, finding.cure) == ("account", "ledger/x-1.json", SetAside())
     (folder / "ledger/x-1.json").unlink()
-    (finding,), _ = check(folder)
-    assert (finding.key, finding.kind) == ("ledger/x-1.json", "account")
+    sealed.ledger.end(LedgerEntry(attempt="y", shard=0, outcome="failed"))
+    for ending in ("json", "start.json"):
+        (folder / f"ledger/y.{ending}").rename(folder / f"ledger/z.{ending}")
+    findings, _ = check(folder)
+    assert [(f.key, f.problem, f.cure) for f in findings] == [
+        ("ledger/z.json", "is the record of another", None)
+    ]
 
 
-def test_a_damaged_end_record_without_a_commit_is_set_aside(sealed: Run):
-    (folder_of(sealed) / "ledger/x-1.json").write_bytes(b"{}")
-    (finding,), _ = check(folder_of(sealed))
-    assert (finding.kind, finding.cure) == ("account", SetAside())
+@pytest.mark.parametrize("key", [commit_key(1), "ledger/x-1.json"])
+@pytest.mark.parametrize(
+    ("stages", "problem"),
+    [
+        ({"stage_wall_s": {"draw": 2.0005}}, ""),  # clocks are read one after the other
+        ({"stage_wall_s": {"draw": 1.6, "settle": 0.6}}, "stage_wall_s: the stages sum to 2.2 s"),
+        ({"stage_cpu_s": {"draw": 2.5}}, "stage_cpu_s: the stages sum to 2.5 s"),
+    ],
+)
+def test_stages_that_take_longer_than_their_attempt(
+    sealed: Run, key: str, stages: dict[str, Any], problem: str
+) -> None:
+    edit(folder_of(sealed) / key, cost=Cost(wall_s=2.0, cpu_s=2.0, **stages).model_dump(mode="json"))
+    findings, _ = check(folder_of(sealed))
+    assert [(f.key, f.cure) for f in findings] == ([(key, None)] if problem else [])
+    assert all(problem in f.problem for f in findings)
 
 
-def test_stages_that_take_longer_than_their_attempt(sealed: Run):
-    cost = Cost(wall_s=2.0, cpu_s=1.0, stage_wall_s={"draw": 1.5, "settle": 1.0}).model_dump(mode="json")
-    edit(folder_of(sealed) / "ledger/x-1.json", cost=cost)
-    (finding,), _ = check(folder_of(sealed))
-    assert finding.kind == "account" and "2.5 s" in finding.problem
+def test_the_ledger_adds_up_what_was_wasted_and_attempts_are_lost_once_their_shards_are_decided(
+    tmp_path: Path,
+) -> None:
+    run = make_run(tmp_path / "run", shards=[1])
+    for name in ("x", "y"):
+        run.ledger.end(LedgerEntry(attempt=name, shard=0, outcome="failed", cost=COST))
+    run.ledger.end(LedgerEntry(attempt="z", shard=0, outcome="lost"))
+    run.ledger.start("open", 0)
+    findings, checked = check(folder_of(run))
+    totals = checked.totals
+    assert (findings, totals.attempts, totals.without_account, totals.unfinished) == ([], 5, 1, 1)
+    assert (totals.committed_wall_s, totals.wasted_wall_s) == (1.0, 6.0)
+    run.quarantine(QUARANTINED)
+    for name, shard in (("late", 1), ("hopeless", 3)):
+        run.ledger.start(name, shard)
+    findings, checked = check(folder_of(run))
+    assert [(f.key, f.shard) for f in findings] == [("ledger/hopeless.json", 3), ("ledger/late.json", 1)]
+    starts = {start.attempt: start for start in run.ledger.unfinished({"a-1"})}
+    for finding in findings:
+        entry = restored(finding, LedgerEntry)
+        assert entry == lost_end(starts[entry.attempt], entry.ended)
 
 
-def test_a_quarantine_record_that_is_damaged_or_of_another_shard(sealed: Run):
-    sealed.grow(60)
-    record = QuarantineRecord(
-        shard=4, seed=0, first_scene=8, scenes=2, attempts=(), causes=(), stacks=(), created=""
-    )
-    sealed.quarantine(record)
-    assert [f for f in check(folder_of(sealed))[0] if f.is_damage] == []
-    path = folder_of(sealed) / "quarantine/000004.json"
-    path.rename(path.with_name("000005.json"))
-    assert ("record", "quarantine/000005.json") in found(folder_of(sealed))
-
-
-# Sealed store ------------------------------------------------------------------------------------
-
-
-def test_files_of_the_sealed_store(sealed: Run):
-    store = folder_of(sealed) / "data.zarr"
-    chunk = store / "label/c.1"
-    data = chunk.read_bytes()
-    chunk.unlink()
-    assert found(folder_of(sealed)) == [("sealed", "data.zarr/label/c.1")]
-    chunk.write_bytes(data)  # other than a link, and equal
-    assert found(folder_of(sealed)) == []
-    chunk.write_bytes(data[:-1] + b"\0")
-    assert found(folder_of(sealed)) == [("sealed", "data.zarr/label/c.1")]
-    chunk.write_bytes(data)
-    for extra in ("label/c.2", "label/c.01", "label/c.x", "other/c.0", "README"):
-        path = store / extra
-        path.parent.mkdir(exist_ok=True)
-        path.write_bytes(b"")
-        assert found(folder_of(sealed)) == [("sealed", f"data.zarr/{extra}")]
-        path.unlink()
-
-
-def test_a_sealed_store_that_says_other_things_than_sealing_would(sealed: Run):
-    path = folder_of(sealed) / "data.zarr/zarr.json"
-    root = json.loads(path.read_text())
-    for change in ({"n": 18}, {"n": 10**11}, {"missing_shards": [0]}, {"rows_sha256": "0" * 64}):
-        path.chmod(0o644)
-        path.write_text(json.dumps(root | {"attributes": root["attributes"] | change}))
-        kinds = [f.kind for f in check(folder_of(sealed))[0] if f.is_damage]
-        assert kinds and set(kinds) <= {"sealed"}, change
-    path.write_text("[]")
-    assert ("sealed", "data.zarr/zarr.json") in found(folder_of(sealed))
-
-
-def test_a_sealed_root_with_an_empty_list_of_parts_is_found_and_sealed_again(merged: Path, sealed: Run):
-    for folder in (folder_of(sealed), merged):
-        path = folder / "data.zarr/zarr.json"
-        whole = json.loads(path.read_text())
-        path.chmod(0o644)
-        path.write_text(json.dumps(whole | {"attributes": whole["attributes"] | {"parts": []}}))
-        (finding,), checked = check(folder)
-        assert (finding.kind, finding.key) == ("sealed", "data.zarr/zarr.json")
-        assert finding.problem == "names rows that no plan wants" and not checked.is_sealed
-        assert repair_runs(open_storage(folder)).left == []
-        assert json.loads(path.read_text()) == whole and found(folder) == []
-
-
-# Merged places -----------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def merged(tmp_path: Path) -> Path:
-    """A merged place of two sealed together."""
-    place = tmp_path / "merged"
-    specs = sorted((small_spec(seed) for seed in (1, 2)), key=lambda spec: spec.hash())
-    for spec, n in zip(specs, (20, 13), strict=True):
-        make_run(place / part_folder(spec.hash()), n, spec=spec)
-    record = encode_record(Merged(parts=tuple(spec.hash() for spec in specs)))
-    storage = open_storage(place)
-    storage.put(MERGED, record)
-    storage.put(f"copies/{MERGED}", record)
-    seal(storage)
-    return place
-
-
-def test_a_merged_place_is_checked_part_by_part_and_as_one_store(merged: Path):
-    findings, checked = check(merged)
-    assert findings == []
-    assert (checked.shards, checked.samples, checked.is_sealed) == (4, 40, True)
-    part = sorted(p.name for p in (merged / "parts").iterdir())[1]
-    (merged / "parts" / part / commit_key(0)).unlink()
-    assert found(merged) == [("record", f"parts/{part}/{commit_key(0)}")]
-
-
-def test_the_record_of_a_merged_place_comes_from_its_copy_or_its_parts(merged: Path):
-    whole = (merged / MERGED).read_bytes()
-    (merged / MERGED).unlink()
-    (finding,), _ = check(merged)
-    assert (finding.key, finding.cure) == (MERGED, Restore(whole))
-    (merged / "copies" / MERGED).unlink()
-    (finding,), _ = check(merged)
-    assert (finding.key, finding.cure) == (MERGED, Restore(whole))
-
-
-def test_a_part_that_is_gone(merged: Path):
-    part = sorted(p for p in (merged / "parts").iterdir())[0]
-    shutil.rmtree(part)
-    findings, _ = check(merged)
-    assert ("record", f"parts/{part.name}/manifest.json") in [(f.kind, f.key) for f in findings]
-    assert not part.exists()
-
-
-def test_nothing_is_written_by_a_check(merged: Path):
-    before = {p: (p.lstat().st_mtime_ns, p.lstat().st_size) for p in merged.rglob("*")}
-    (merged / MERGED).write_bytes(b"")
-    before[merged / MERGED] = ((merged / MERGED).stat().st_mtime_ns, 0)
-    check(merged)
-    assert {p: (p.lstat().st_mtime_ns, p.lstat().st_size) for p in merged.rglob("*")} == before
+def test_quarantine_records_of_others_are_found_and_half_written_or_lifted_ones_are_no_damage(
+    tmp_path: Path,
+) -> None:
+    run = make_run(tmp_path / "run", shards=[1])
+    run.quarantine(QUARANTINED)
+    run.storage.put("quarantine/000004.json.part", b"{")
+    assert found(folder_of(run)) == []
+    path = folder_of(run) / "quarantine/000003.json"
+    path.rename(path.with_name("000004.json"))
+    assert found(folder_of(run)) == [("record", "quarantine/000004.json")]
+    path.with_name("000004.json").rename(path)
+    edit(path, seed=7)
+    assert found(folder_of(run)) == [("record", "quarantine/000003.json")]
+    edit(path, seed=0)
+    assert lift_quarantine(run) == [3] and found(folder_of(run)) == []
+    assert open_storage(folder_of(run)).exists("quarantine/000003.lifted-1.json")
