@@ -15,6 +15,7 @@ import zarr
 from obstore.store import from_url
 from zarr.storage import ObjectStore
 
+from datagen.cluster.run_recorder import close_lost_attempts
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
 from datagen.schemas.fields import SCHEMAS, RecordSchema
@@ -77,7 +78,8 @@ def resume(storage: Storage) -> None:
     """Make the missing shards, as `datagen resume` does, and seal."""
     for run in open_runs(storage):
         for shard in run.missing():
-            assert attempt(run, shard, f"again-{shard}-{run.layout.scenes_per_shard}")
+            assert attempt(run, shard, f"again-{shard}-{len(run.ledger.attempts())}")
+        close_lost_attempts(run)
     seal(storage)
 
 

@@ -1,4 +1,4 @@
-"""Removal of leftover files: committed and young files stay, and nothing is removed while a job runs."""
+"""Removal of leftover files: what records name and young files stay; nothing is removed while a job runs."""
 
 from __future__ import annotations
 
@@ -14,21 +14,14 @@ import pytest
 from datagen.schemas.checking.cleaning import clean_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobRecord, Jobs, JobState, new_job_id
-from datagen.schemas.record_files import (
-    MERGED,
-    commit_copy_key,
-    commit_key,
-    encode_record,
-    part_folder,
-    shard_folder,
-    utc_now,
-)
-from datagen.schemas.run import Run
-from datagen.schemas.run_records import Merged
+from datagen.schemas.record_files import commit_key, utc_now
+from datagen.schemas.run import Run, open_runs
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage, open_storage
-from tests.made_runs import attempt, check_digests, files_of, make_run, small_spec, write
+from tests.made_runs import attempt, files_of, make_run, write
+from tests.schemas.checked import fill, folder_of, found, merge, tree
 
+pytestmark = pytest.mark.usefixtures("few_arrays")
 HOUR_S = 3600
 
 
@@ -39,51 +32,53 @@ def littered(folder: Path | str) -> tuple[Run, set[str]]:
     write(run, 3, "never-committed")
     run.ledger.start("never-committed", 3)
     seal(run.storage)
-    keys = {
+    garbage = {
         f"commits/000007.json.{'a' * 16}.part",
-        f"{shard_folder(0, 'a-0')}/zarr.json.{'b' * 16}.part",
+        f"shards/x.zip.{'b' * 16}.part",
         f".probe-{'c' * 16}",
-        f"data.zarr.{'d' * 16}.partial/label/c.0",
+        "data-2.zarr/label/c.0",
+        "data-2.zarr/zarr.json",
     }
-    for key in keys:
+    for key in garbage:
         run.storage.put(key, b"left behind")
-    for name in (shard_folder(1, "late"), shard_folder(3, "never-committed")):
-        keys |= {file.key for file in run.storage.list(name)}
-    return run, keys
+    return run, garbage | {"shards/late.zip", "shards/never-committed.zip"}
 
 
 def age(run: Run, keys: Iterable[str], seconds: float) -> None:
     for key in keys:
-        os.utime(Path(run.storage.url, key), (time.time() - seconds,) * 2)
+        os.utime(folder_of(run) / key, (time.time() - seconds,) * 2)
 
 
-def kept(folder: Path, garbage: Iterable[str] = ()) -> dict[str, bytes]:
-    return {k: data for k, data in files_of(folder).items() if k not in set(garbage)}
+def without(storage: Storage, garbage: Iterable[str]) -> dict[str, bytes | None]:
+    return {key: data for key, data in tree(storage).items() if key not in set(garbage)}
 
 
-def test_garbage_is_removed_and_everything_else_keeps_its_bytes(tmp_path: Path) -> None:
-    run, garbage = littered(tmp_path)
-    before = kept(tmp_path, garbage)
-    cleaned = clean_runs(run.storage, kept_s=-60)
+@pytest.mark.parametrize("place", ["disk", "s3"])
+def test_garbage_is_removed_and_everything_else_keeps_its_bytes(
+    place: str, tmp_path: Path, bucket: str
+) -> None:
+    run, garbage = littered(tmp_path / "run" if place == "disk" else f"{bucket}/run")
+    before = without(run.storage, garbage)
+    cleaned = clean_runs(run.storage, kept_s=-HOUR_S)
     assert (cleaned.files, cleaned.attempts) == (len(garbage), 2) and cleaned.bytes > 0
-    assert kept(tmp_path) == before
-    assert not (tmp_path / shard_folder(1, "late")).exists() and not list(tmp_path.glob("data.zarr.*"))
-    check_digests(run, run.commit_of(0))
-    assert len(list(run.ledger.ends())) == 4  # the ledger keeps them all
-    assert clean_runs(run.storage, kept_s=-60).files == 0
+    assert tree(run.storage) == before and not (tmp_path / "run" / "data-2.zarr").exists()
+    assert {attempt.split("-")[0] for attempt in run.ledger.attempts()} == {
+        "a",
+        "late",
+        "never",
+    }  # all are kept
+    assert clean_runs(run.storage, kept_s=-HOUR_S).files == 0 and found(run.storage.url) == []
 
 
-def test_files_of_the_last_hour_are_kept(tmp_path: Path) -> None:
-    run, _ = littered(tmp_path)
-    before = kept(tmp_path)
-    assert clean_runs(run.storage).files == 0 and kept(tmp_path) == before
-    age(run, [file.key for file in run.storage.list("")], 2 * HOUR_S)
-    age(run, [f"{shard_folder(1, 'late')}/zarr.json", "ledger/never-committed.start.json"], 60)
+def test_files_of_the_last_hour_and_stores_that_are_being_written_are_kept(tmp_path: Path) -> None:
+    run, garbage = littered(tmp_path)
+    before = files_of(tmp_path)
+    assert clean_runs(run.storage).files == 0 and files_of(tmp_path) == before
+    age(run, files_of(tmp_path), 2 * HOUR_S)
+    young = {"shards/late.zip", "data-2.zarr/zarr.json"}
+    age(run, young, 60)
     clean_runs(run.storage)
-    left = kept(tmp_path)
-    assert f"{shard_folder(1, 'late')}/label/c.0" in left
-    assert f"{shard_folder(3, 'never-committed')}/label/c.0" in left
-    assert f".probe-{'c' * 16}" not in left
+    assert files_of(tmp_path).keys() == before.keys() - garbage | young | {"data-2.zarr/label/c.0"}
 
 
 @pytest.mark.parametrize(
@@ -106,29 +101,22 @@ def test_nothing_is_removed_while_a_job_may_be_alive(
     assert clean_runs(run.storage, kept_s=-60).files == len(garbage)
 
 
-def test_an_attempt_that_a_lost_commit_may_name_is_kept(tmp_path: Path) -> None:
-    run = make_run(tmp_path, n=50, shards=[0, 1])
-    run.storage.delete([commit_key(1)])
-    (tmp_path / commit_key(0)).write_bytes(b"{}")
-    write(run, 0, "other")
-    assert clean_runs(run.storage, kept_s=-60).files == 0
-    assert run.storage.exists(commit_copy_key(1, "a-1"))
-
-
-def test_an_attempt_whose_files_were_removed_cannot_be_committed(tmp_path: Path) -> None:
-    run = make_run(tmp_path, n=20, shards=[])
-    commit = write(run, 0, "slow")
-    clean_runs(run.storage, kept_s=-60)
-    with pytest.raises(InputError, match="is missing"):
-        run.commit(commit)
-    assert run.committed() == set() and attempt(run, 0, "next")
+def test_nothing_is_removed_where_a_damaged_record_may_name_it(tmp_path: Path) -> None:
+    run, _ = littered(tmp_path)
+    for key in (commit_key(0), "data.json"):
+        whole = (tmp_path / key).read_bytes()
+        (tmp_path / key).write_bytes(b"{}")
+        with pytest.raises(InputError, match=key):
+            clean_runs(run.storage, kept_s=-60)
+        assert all((tmp_path / name).exists() for name in ("shards/a-0.zip", "data.zarr/zarr.json"))
+        (tmp_path / key).write_bytes(whole)
 
 
 def test_an_interrupted_removal_is_completed_by_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, garbage = littered(tmp_path)
-    before, plain = kept(tmp_path, garbage), Storage.delete
+    before, plain = without(run.storage, garbage), Storage.delete
 
     def dies(storage: Storage, keys: Any) -> None:
         some = list(keys)
@@ -140,18 +128,18 @@ def test_an_interrupted_removal_is_completed_by_the_next(
         patch.setattr(Storage, "delete", dies)
         clean_runs(run.storage, kept_s=-60)
     clean_runs(run.storage, kept_s=-60)
-    assert kept(tmp_path) == before
+    assert tree(run.storage) == before
 
 
-def test_merged_runs_and_runs_on_s3_are_cleaned_as_on_a_disk(tmp_path: Path, bucket: str) -> None:
-    run, garbage = littered(f"{bucket}/run")
-    assert clean_runs(run.storage, kept_s=-3600).files == len(garbage)
-    specs = sorted((small_spec(seed) for seed in (1, 2)), key=lambda spec: spec.hash())
-    parts = [make_run(tmp_path / part_folder(spec.hash()), 10, spec=spec) for spec in specs]
-    storage = open_storage(tmp_path)
-    storage.put(MERGED, encode_record(Merged(parts=tuple(spec.hash() for spec in specs))))
-    write(parts[0], 0, "late")
+def test_parts_of_merged_runs_are_cleaned(tmp_path: Path) -> None:
+    for who, seed in (("a", 1), ("b", 2)):
+        fill(tmp_path, who, [0], seed=seed)
+    merge(tmp_path, "ab")
+    storage = open_storage(tmp_path / "out")
+    before = tree(storage)
+    part = open_runs(storage)[1]
+    write(part, 0, "late")
+    for key in (f".probe-{'c' * 16}", "data.zarr/x"):
+        part.storage.put(key, b"")
     storage.put(f".probe-{'c' * 16}", b"")
-    before = kept(tmp_path, [f".probe-{'c' * 16}"])
-    clean_runs(storage, kept_s=-60)
-    assert kept(tmp_path) == {k: v for k, v in before.items() if "/late/" not in k}
+    assert clean_runs(storage, kept_s=-60).files == 4 and tree(storage) == before

@@ -110,7 +110,7 @@ def _set_aside(storage: Storage, key: str, finding: Finding, into: str) -> None:
     if commit is not None and foreign_field(run.manifest, finding.shard, commit):
         commit = None  # the object that it names is not this shard's
     rows = f"{_prefix(storage, run)}{object_key(commit.attempt)}" if commit else ""
-    _move(storage, [key, rows] if rows and storage.exists(rows) else [key], into)
+    _move(storage, [rows, key] if rows else [key], into)  # the commit last: without it nothing is found
     if commit is not None:
         run.ledger.end(
             LedgerEntry(
@@ -143,7 +143,9 @@ def _reseal(storage: Storage, result: Repaired) -> bool:
     if result.resealed or (result.checked.is_sealed and not odd):
         return False
     why = "Repair the other findings first: the run cannot be sealed before"
-    if not any(finding.kind not in _HARMLESS for finding in result.left):
+    kinds = {finding.kind for finding in result.left}
+    # A store that holds lost shards is kept until these are made again, unless it is damaged itself.
+    if kinds <= {*_HARMLESS, *({"lost"} if "sealed" in kinds else ())}:
         try:
             runs = open_runs(storage)
             if any(ShardRanges.of(run.committed()).without(run.planned()) for run in runs if not run.scenes):
@@ -151,8 +153,7 @@ def _reseal(storage: Storage, result: Repaired) -> bool:
             else:
                 result.resealed = True
                 has_labels = label_counts(runs).labels > 0
-                if not has_labels or any(f.kind == "sealed" for f in result.left):
-                    _forget_store(storage)
+                _forget_store(storage, is_damaged="sealed" in kinds)
                 if has_labels:
                     seal(storage)
                 return result.checked.is_sealed or has_labels
