@@ -125,6 +125,10 @@ def test_every_damaged_file_is_found_and_named_with_its_fix(kind: str, sealed: R
             else:
                 named = [f for f in findings if f.key == key]
                 assert named and all(f.problem and f.fix for f in named), (key, what, findings)
+                if key.split("/")[-2:-1] in (["plans"], ["copies"]) or key.endswith(
+                    ("manifest.json", MERGED)
+                ):
+                    assert named[0].cure == Restore(whole), (key, what)
         path.write_bytes(whole)
     assert found(folder) == is_stale
 
@@ -161,18 +165,6 @@ def test_places_without_a_run_and_other_formats_are_refused(sealed: Run, tmp_pat
 # Root records --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("key", ["manifest.json", "plans/1.json"])
-@pytest.mark.parametrize("copies", ["", "copies/"])
-def test_root_records_and_their_copies_restore_each_other(sealed: Run, key: str, copies: str) -> None:
-    path = folder_of(sealed) / f"{copies}{key}"
-    whole = path.read_bytes()
-    for data in (None, whole[:-1], b""):
-        path.unlink() if data is None else path.write_bytes(data)
-        finding = only(sealed)
-        assert (finding.kind, finding.key, finding.cure) == ("record", f"{copies}{key}", Restore(whole))
-        path.write_bytes(whole)
-
-
 def test_signed_records_that_differ_from_their_copies_or_in_form_are_found(sealed: Run) -> None:
     folder = folder_of(sealed)
     edit(folder / "manifest.json", code_version="9")
@@ -205,12 +197,7 @@ def test_plans_that_are_gone_or_shrink(tmp_path: Path) -> None:
     assert found(folder) == [("record", "plans/2.json")]
 
 
-def test_merged_runs_are_restored_from_the_copy_and_miss_a_part(merged: Path) -> None:
-    whole = (merged / MERGED).read_bytes()
-    (merged / MERGED).unlink()
-    (finding,), _ = check(merged)
-    assert (finding.key, finding.cure) == (MERGED, Restore(whole))
-    (merged / MERGED).write_bytes(whole)
+def test_a_missing_part_of_merged_runs_is_found(merged: Path) -> None:
     part = min((merged / "parts").iterdir())
     shutil.rmtree(part)
     assert ("record", f"parts/{part.name}/manifest.json") in found(merged) and not part.exists()
