@@ -36,16 +36,15 @@ FEW = (
     *("scene_index", "redraws", "house_id", "points_m"),
     *("sample_id", "sample_scene_index", "candidate_index", "label", "distance_m"),
 )
-_HEURISTIC = SCHEMAS["heuristic"]
+FULL = SCHEMAS["heuristic"]
 
 
 def few_fields() -> RecordSchema:
     """The heuristic schema with few fields."""
     scenes, samples = (
-        tuple(f for f in fields if f.name in FEW)
-        for fields in (_HEURISTIC.scene_fields, _HEURISTIC.sample_fields)
+        tuple(f for f in fields if f.name in FEW) for fields in (FULL.scene_fields, FULL.sample_fields)
     )
-    return replace(_HEURISTIC, scene_fields=scenes, sample_fields=samples)
+    return replace(FULL, scene_fields=scenes, sample_fields=samples)
 
 
 def folder_of(run: Run) -> Path:
@@ -112,6 +111,10 @@ def edit(path: Path, **changes: Any) -> None:
 
 
 # Rows ----------------------------------------------------------------------------------------
+
+
+def of(run: Run, *shards: int) -> list[tuple[Run, int]]:
+    return [(run, shard) for shard in shards]
 
 
 def expected(shards: Iterable[tuple[Run, int]], scenes: int | None = None, n: int | None = None) -> Arrays:

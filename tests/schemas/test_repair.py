@@ -21,7 +21,7 @@ from datagen.schemas.run import Run, open_runs
 from datagen.schemas.storage import Storage, open_storage
 from tests.made_runs import files_of, make_run, small_spec
 from tests.schemas.checked import (
-    _HEURISTIC,
+    FULL,
     assert_rows,
     fill,
     folder_of,
@@ -89,7 +89,7 @@ def test_repair_and_resume_give_the_rows_of_the_undamaged_run(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if kind == "relabelled":
-        monkeypatch.setitem(SCHEMAS, "heuristic", _HEURISTIC)
+        monkeypatch.setitem(SCHEMAS, "heuristic", FULL)
     again, place = KINDS[kind](tmp_path), tmp_path / "run"
     rows, rng = stored(open_storage(place)), np.random.default_rng(3)
     shutil.copytree(place, tmp_path / "whole")
