@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datagen.cluster.shard_policy import ShardFailures
-from datagen.schemas.record_files import commit_key, lost_end, utc_now
+from datagen.schemas.record_files import commit_key, utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, LedgerEntry, QuarantineRecord, ShardRanges
 
@@ -49,9 +49,4 @@ def close_lost_attempts(run: Run) -> int:
     still running, its own record replaces this one. Attempts of open shards stay open for the job that
     resumes.
     """
-    committed = {commit.attempt: commit.shard for commit in run.commits()}
-    decided = set(committed.values()) | run.quarantined()
-    lost = [start for start in run.ledger.unfinished(committed) if start.shard in decided]
-    for start in lost:
-        run.ledger.end(lost_end(start, utc_now()))
-    return len(lost)
+    return run.close_lost_attempts(utc_now())

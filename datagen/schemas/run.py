@@ -24,6 +24,7 @@ from datagen.schemas.record_files import (
     commit_key,
     decode_record,
     encode_record,
+    lost_end,
     object_key,
     publish,
     read_record,
@@ -244,6 +245,15 @@ class Run:
         if data is None or len(data) != entry.size or sha256(data).hexdigest() != entry.sha256:
             raise InputError(f"{self.storage.url}/{key}", "", problem, REPAIR)
         return data
+
+    def close_lost_attempts(self, ended: str = "") -> int:
+        """End attempts without an end, as lost, whose shard is decided without them; return their number."""
+        committed = {commit.attempt: commit.shard for commit in self.commits()}
+        decided = set(committed.values()) | self.quarantined()
+        lost = [start for start in self.ledger.unfinished(committed) if start.shard in decided]
+        for start in lost:
+            self.ledger.end(lost_end(start, ended))
+        return len(lost)
 
     # Quarantine.
 

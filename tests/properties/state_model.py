@@ -66,6 +66,14 @@ class Place:
     def rule(self) -> str:
         return next(iter(self.parts))[1]
 
+    @property
+    def has_lost(self) -> bool:
+        """Whether the store has rows of a shard that is not committed now."""
+        held = self.sealed or {}
+        return any(
+            part.committed & set(part.planned) - self.parts[key].committed for key, part in held.items()
+        )
+
 
 # Specifications by seed and rule; those of relabelled runs come from the program.
 SPECS: dict[tuple[int, str], Specification] = {}

@@ -79,7 +79,7 @@ def test_relabelling_is_casting_rays_again(rule: dict[str, Any], source: Path) -
         theirs = Run.open(place / "cast")
         assert ours.manifest.spec == theirs.manifest.spec
         for mine, other in zip(ours.commits(), theirs.commits(), strict=True):
-            assert {e.path: e for e in mine.files} == {e.path: e for e in other.files}
+            assert mine.object.sha256 == other.object.sha256
         arrays = arrays_of(place / "ours")
         assert_equal_runs(arrays, arrays_of(place / "cast"))
     params = ours.manifest.spec.heuristic

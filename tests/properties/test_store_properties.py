@@ -17,7 +17,8 @@ from datagen.schemas.fields import Field, RecordSchema
 from datagen.schemas.run_records import Layout
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_files import encode_shard
-from datagen.schemas.shard_reading import decode_chunk, parse_metadata
+from datagen.schemas.shard_sources import ZipFiles
+from datagen.schemas.stored_arrays import StoredArray, decode_chunk, parse_metadata
 from datagen.train.reader import SampleReader
 from tests.made_runs import make_run
 
@@ -46,15 +47,20 @@ def fields_and_values(draw: st.DrawFn) -> tuple[Field, int, np.ndarray[Any, Any]
     return Field("value", dtype, dims, "1", "", "anything"), rows, values
 
 
+def encoded(field: Field, rows: int, values: np.ndarray[Any, Any]) -> tuple[StoredArray, bytes]:
+    """The array and its only chunk in the object of a shard of one array."""
+    schema = RecordSchema("any", 1, (field,), (), {"a": 2, "b": 3})
+    layout = Layout(scenes_per_shard=rows, candidates_per_scene=1)
+    files = ZipFiles("place", encode_shard(schema, layout, "0" * 64, {"value": values}, {}))
+    (chunk,) = (path for path in files.paths if path.startswith("value/c."))
+    return parse_metadata("place", "value", files.get("value/zarr.json")), files.get(chunk)
+
+
 @given(fields_and_values())
 @settings(max_examples=120, deadline=None)
 def test_any_valid_batch_comes_back_bit_for_bit(case: tuple[Field, int, np.ndarray[Any, Any]]):
     field, rows, values = case
-    schema = RecordSchema("any", 1, (field,), (), {"a": 2, "b": 3})
-    layout = Layout(scenes_per_shard=rows, candidates_per_scene=1)
-    files = encode_shard(schema, layout, "0" * 64, {"value": values}, {})
-    array = parse_metadata("place", "value", files["value/zarr.json"])
-    (chunk,) = (data for path, data in files.items() if path.startswith("value/c."))
+    array, chunk = encoded(field, rows, values)
     back = decode_chunk("place", array, chunk)
     assert back.shape == values.shape
     if field.is_text:
@@ -68,11 +74,7 @@ def test_any_valid_batch_comes_back_bit_for_bit(case: tuple[Field, int, np.ndarr
 @settings(max_examples=60, deadline=None)
 def test_damaged_bytes_never_pass_and_never_crash(case: tuple[Field, int, np.ndarray[Any, Any]], data: Any):
     field, rows, values = case
-    schema = RecordSchema("any", 1, (field,), (), {"a": 2, "b": 3})
-    layout = Layout(scenes_per_shard=rows, candidates_per_scene=1)
-    files = encode_shard(schema, layout, "0" * 64, {"value": values}, {})
-    array = parse_metadata("place", "value", files["value/zarr.json"])
-    (chunk,) = (data for path, data in files.items() if path.startswith("value/c."))
+    array, chunk = encoded(field, rows, values)
     where = data.draw(st.integers(0, len(chunk) - 1))
     end = data.draw(st.integers(where + 1, len(chunk)))
     # Up to four changed bytes in a row are a burst that crc32c always sees.

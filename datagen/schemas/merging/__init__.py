@@ -156,6 +156,7 @@ def _write(part: Part, run: Run, tick: Tick) -> WrittenPart:
     for source, commit in part.spare:
         if run.commit_of(commit.shard).attempt != commit.attempt:
             run.ledger.end(_end_of_spare(part.runs[source], commit))
+    run.close_lost_attempts()  # of shards that another source has
     return WrittenPart(run, len(there), len(new), len(part.spare))
 
 
