@@ -24,9 +24,10 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.identity import sample_ids
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Commit, ShardRanges, StageClock
+from datagen.schemas.run_records import Commit, StageClock
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_files import encode_array, group_metadata, zipped
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.shard_reading import committed_place
 from datagen.schemas.shard_sources import ZipFiles
 from datagen.schemas.specification import Specification

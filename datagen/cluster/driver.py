@@ -35,7 +35,8 @@ from datagen.cluster.shard_policy import (
     too_many_quarantined,
     window,
 )
-from datagen.schemas.run_records import Commit, LedgerEntry, Outcome, ShardRanges
+from datagen.schemas.run_records import Commit, LedgerEntry, Outcome
+from datagen.schemas.shard_ranges import ShardRanges
 
 T = TypeVar("T")
 # Upper bound of one wait, so that a stop request is handled soon.

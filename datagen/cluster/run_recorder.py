@@ -5,7 +5,8 @@ from __future__ import annotations
 from datagen.cluster.shard_policy import ShardFailures
 from datagen.schemas.record_files import commit_key, utc_now
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Commit, LedgerEntry, QuarantineRecord, ShardRanges
+from datagen.schemas.run_records import Commit, LedgerEntry, QuarantineRecord
+from datagen.schemas.shard_ranges import ShardRanges
 
 
 class RunRecorder:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from datagen.cluster.protocol import AttemptReport
-from datagen.schemas.run_records import ShardRanges
+from datagen.schemas.shard_ranges import ShardRanges
 
 Action = Literal["done", "retry", "quarantine", "drop", "abort"]
 

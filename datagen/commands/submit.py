@@ -37,7 +37,8 @@ from datagen.jobs.start_job import (
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import MERGED, refuse_other
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Manifest, ShardRanges, StageClock
+from datagen.schemas.run_records import Manifest, StageClock
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import open_storage
 from datagen.workers.houses import open_houses
 from datagen.workers.labels import load_label_source

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import ShardRanges
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.shard_reading import read_committed
 
 Array = npt.NDArray[Any]

@@ -7,8 +7,8 @@ from typing import Any
 
 from datagen.schemas.quarantine import lifted_records
 from datagen.schemas.run import Run, open_runs
-from datagen.schemas.run_records import ShardRanges
 from datagen.schemas.sealing import StoreRecord, store_record
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage
 
 _SHOWN = 20  # causes and stacks

@@ -43,10 +43,10 @@ from datagen.schemas.run_records import (
     Merged,
     Plan,
     QuarantineRecord,
-    ShardRanges,
     foreign_field,
     other_value,
 )
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage, open_storage
 
 MOST_SAMPLES = 10**12  # of a run

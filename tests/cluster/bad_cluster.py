@@ -13,7 +13,8 @@ import numpy as np
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.protocol import AttemptReport, JobSummary, JobTotals, StopRequest
 from datagen.cluster.shard_policy import RetryPolicy, ShardFailures
-from datagen.schemas.run_records import Commit, ShardRanges
+from datagen.schemas.run_records import Commit
+from datagen.schemas.shard_ranges import ShardRanges
 from tests.cluster.simulated import FakeClock, Heard, PaperRecorder, commit_by, report_of
 
 # Share of attempts, and how they end. What is silent never ends by itself.

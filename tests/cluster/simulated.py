@@ -10,7 +10,8 @@ from dataclasses import dataclass, field, replace
 from datagen.cluster.driver import AttemptOrder
 from datagen.cluster.protocol import AttemptReport, JobTotals
 from datagen.cluster.shard_policy import RetryPolicy, ShardFailures
-from datagen.schemas.run_records import Commit, Cost, FileEntry, Host, LedgerEntry, ShardRanges
+from datagen.schemas.run_records import Commit, Cost, FileEntry, Host, LedgerEntry
+from datagen.schemas.shard_ranges import ShardRanges
 
 # How an attempt ends, and the seconds it takes; None never ends by itself.
 Fate = tuple[str, float | None]

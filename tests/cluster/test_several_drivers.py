@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.protocol import AttemptReport, JobSummary, StopRequest
 from datagen.cluster.shard_policy import OpenShards, RetryPolicy
-from datagen.schemas.run_records import ShardRanges
+from datagen.schemas.shard_ranges import ShardRanges
 from tests.cluster.simulated import FakeClock, Fate, Heard, PaperRecorder, SimulatedExecutor
 
 SHARD_S, LOOK_S = 5.0, 0.01

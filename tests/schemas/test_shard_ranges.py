@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.schemas.run_records import ShardRanges
+from datagen.schemas.shard_ranges import ShardRanges
 
 SETS = st.sets(st.integers(0, 60), max_size=40)
 

@@ -27,9 +27,10 @@ from datagen.schemas.record_files import (
     utc_now,
 )
 from datagen.schemas.run import Run, open_runs
-from datagen.schemas.run_records import AttemptStart, Cost, LedgerEntry, Plan, QuarantineRecord, ShardRanges
+from datagen.schemas.run_records import AttemptStart, Cost, LedgerEntry, Plan, QuarantineRecord
 from datagen.schemas.sealing import store_record
 from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import open_storage
 from tests.made_runs import attempt, files_of, make_run, rows_of
 from tests.schemas.checked import (

@@ -18,15 +18,17 @@ from datagen.schemas.checking.finding import Finding, Reseal, Restore, SetAside,
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import SET_ASIDE, commit_key, object_key
 from datagen.schemas.run import Run, label_counts, open_runs
-from datagen.schemas.run_records import MAX_FILE_BYTES, Commit, LedgerEntry, ShardRanges, foreign_field
+from datagen.schemas.run_records import Commit, LedgerEntry, foreign_field
 from datagen.schemas.sealing import CLAIM, remove_store, seal, store_record
 from datagen.schemas.sealing.contents import RECORD, SEALED
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage
 
 # Restoring a record reveals what depends on it: commits, then shards, then the sealed store.
 _PASSES = 6
 # Kinds of findings that do not keep a run from being sealed.
 _HARMLESS = ("account", "sealed", "stale")
+_MOST_BYTES = 2**31  # of a file that is set aside
 _CAUSE = "its shard was set aside by datagen verify --repair"
 
 Seen = Callable[[int, int], None]
@@ -128,7 +130,7 @@ def _set_aside(storage: Storage, key: str, finding: Finding, into: str) -> None:
 def _move(storage: Storage, keys: Iterable[str], into: str) -> None:
     """Move files into a folder: each exists there, durably, before it is removed."""
     for key in keys:
-        data = storage.get(key, MAX_FILE_BYTES)
+        data = storage.get(key, _MOST_BYTES)
         if data is not None:
             storage.put_new(f"{into}/{key}", data)
             storage.delete([key])
@@ -167,8 +169,10 @@ def _reseal(storage: Storage, result: Repaired) -> bool:
     return False
 
 
-def _forget_store(storage: Storage) -> None:
-    """Remove a damaged store: an undamaged one is replaced once the new one is written."""
+def _forget_store(storage: Storage, is_damaged: bool) -> None:
+    """Remove a store that is damaged: an undamaged one is replaced once the new one is written."""
+    if not is_damaged:
+        return
     record = None
     with suppress(InputError):  # its record is damaged
         record = store_record(storage)

@@ -25,9 +25,9 @@ from datagen.schemas.run_records import (
     Merged,
     MergedPart,
     Plan,
-    ShardRanges,
     other_value,
 )
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage
 
 _MANIFEST = "manifest.json"

@@ -8,7 +8,6 @@ from hashlib import sha256
 from datagen.schemas.checking.finding import Finding, Reseal, curable
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import ShardRanges
 from datagen.schemas.sealing import claimed_names
 from datagen.schemas.sealing.contents import (
     RECORD,
@@ -17,6 +16,7 @@ from datagen.schemas.sealing.contents import (
     read_contents,
     store_record,
 )
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage
 
 
@@ -59,8 +59,11 @@ def check_store(storage: Storage, record: StoreRecord, runs: list[Run], is_sound
     if is_stale:
         lost = sum(len(_lost(run, part)) for run in runs if (part := record.part_of(run)))
         if lost:
-            problem = f"has {lost} shards without a commit: `datagen resume` makes them again"
-            yield curable(RECORD, "lost", problem, Reseal())
+            problem, fix = (
+                f"has {lost} shards whose commits are missing",
+                "Make them again with `datagen resume`",
+            )
+            yield Finding(RECORD, "lost", problem, fix)
         else:
             yield curable(
                 record.name, "stale", "is not of the committed shards; nothing is damaged", Reseal()

@@ -12,7 +12,8 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.merging.conflicts import refuse_different_rows
 from datagen.schemas.record_files import different_fields, encode_record, part_folder
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import OPEN_END, Commit, Layout, Manifest, MergedPart, Plan, ShardRanges
+from datagen.schemas.run_records import OPEN_END, Commit, Layout, Manifest, MergedPart, Plan
+from datagen.schemas.shard_ranges import ShardRanges
 
 # Fields that may differ between merged runs: they give other samples of the same kind.
 FREE_FIELDS = ("seed", "split", "houses", "objects", "scenes_from")

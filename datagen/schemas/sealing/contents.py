@@ -19,9 +19,9 @@ from datagen.schemas.run_records import (
     FileEntry,
     Layout,
     Ranges,
-    ShardRanges,
     StoredRecord,
 )
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage
 
 SEALED = "data.zarr"
