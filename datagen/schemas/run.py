@@ -167,10 +167,11 @@ class Run:
 
     def planned(self, n: int | None = None) -> ShardRanges:
         """The shards whose rows count among the first n samples [the wanted ones]."""
-        size, end = self.layout.scenes_per_shard, self.layout.shards_for(self.n if n is None else n)
+        n = self.n if n is None else n
         if self.scenes is None:
-            return ShardRanges.of(range(end))
-        return self.scenes.blocks(size).within(ShardRanges.of(range(end)))
+            return ShardRanges.of(range(self.layout.shards_for(n)))
+        scenes = ShardRanges.of(range(-(-n // self.layout.candidates_per_scene)))
+        return self.scenes.within(scenes).blocks(self.layout.scenes_per_shard)
 
     def samples_wanted(self, n: int) -> int:
         """Of the first n samples those that count."""

@@ -27,7 +27,6 @@ from datagen.schemas.sealing import seal
 from datagen.schemas.shard_files import (
     MAX_CHUNK_BYTES,
     chunk_rows,
-    encode_array,
     encode_shard,
     group_metadata,
     zarr_metadata,
@@ -265,10 +264,3 @@ def test_an_object_with_other_bytes_than_were_committed_is_damage(tmp_path: Path
         assert found(tmp_path) == [("file", "shards/a-1.zip")]
         with pytest.raises(InputError, match=r"shards/a-1\.zip"):
             read_shard(Run.open(tmp_path), 1)
-
-
-def test_a_chunk_of_one_array_is_encoded_alone_as_in_a_shard() -> None:
-    scenes, samples = tables_of(SCHEMA, LAYOUT, 0, 0)
-    files = files_in(encode_shard(SCHEMA, LAYOUT, HASH, scenes, samples))
-    for table, f in SCHEMA.fields:
-        assert encode_array(SCHEMA, LAYOUT, table, f, (scenes | samples)[f.name]).items() <= files.items()
