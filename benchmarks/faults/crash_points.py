@@ -13,12 +13,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-import tempfile
-from pathlib import Path
 
 from tests.faults.crash_points_campaign import run_campaign
 from tests.faults.crash_points_operations import OPERATIONS
-from tests.faults.crash_points_shim import build
 
 
 def main() -> int:
@@ -31,19 +28,17 @@ def main() -> int:
     print(f"{'operation':<16}" + "".join(f"{head:>9}" for head in heads) + f"{'violations':>12}")
     violations: list[str] = []
     sums = dict.fromkeys(heads, 0)
-    with tempfile.TemporaryDirectory(prefix="crash-points-") as folder:
-        library = build(Path(folder))
-        for name in options.only or [operation.name for operation in OPERATIONS]:
-            (found,) = run_campaign([name], options.sample, library)
-            for head in heads:
-                sums[head] += getattr(found, head)
-            print(
-                f"{found.operation:<16}"
-                + "".join(f"{getattr(found, head):>9,}" for head in heads)
-                + f"{len(found.violations):>12,}",
-                flush=True,
-            )
-            violations += [f"{found.operation}: {violation}" for violation in found.violations]
+    for name in options.only or [operation.name for operation in OPERATIONS]:
+        (found,) = run_campaign([name], options.sample)
+        for head in heads:
+            sums[head] += getattr(found, head)
+        print(
+            f"{found.operation:<16}"
+            + "".join(f"{getattr(found, head):>9,}" for head in heads)
+            + f"{len(found.violations):>12,}",
+            flush=True,
+        )
+        violations += [f"{found.operation}: {violation}" for violation in found.violations]
     print(f"{'all':<16}" + "".join(f"{sums[head]:>9,}" for head in heads) + f"{len(violations):>12,}")
     for violation in violations[:50]:
         print(violation)

@@ -35,7 +35,7 @@ def one(upstream: int, shards: int, seed: int, rate: float, folder: Path) -> Out
         hold=share,
         hold_s=1.5 * TIMEOUT_S,
         seed=seed,
-        down_after=[200, 70 * shards, 140 * shards],
+        down_after=[100, 20 * shards, 30 * shards],
         down_for_s=1.75 * TIMEOUT_S,
         down_at_commits=[shards // 3, 2 * shards // 3],
     )

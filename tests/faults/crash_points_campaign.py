@@ -1,6 +1,6 @@
 """Kill or fail an operation at each of its calls, and see that every unit is absent or there, whole.
 
-This process has the shim loaded and everything imported, and starts no thread: it forks a child for each
+This process has everything imported, and starts no thread: it forks a child for each
 point, and another that looks with fresh eyes. Run as a program it prints its findings as JSON.
 """
 
@@ -79,15 +79,15 @@ class _Reference:
     calls: list[Call]
 
 
-def campaign(shim: Shim, work: Path, operations: Iterable[Operation], sample: int | None) -> list[Finding]:
+def campaign(work: Path, operations: Iterable[Operation], sample: int | None) -> list[Finding]:
     """Try the operations at all their points, or at N of each kind of end."""
     findings: list[Finding] = []
     for operation in operations:
         _warm_up(operation)
-        known = _reference(shim, work, operation)
+        known = _reference(work, operation)
         finding = Finding(operation.name, len(known.calls))
         for point in points(known.calls, sample):
-            _try(shim, work, operation, known, point, finding)
+            _try(work, operation, known, point, finding)
         shutil.rmtree(work / operation.name)
         findings.append(finding)
     return findings
@@ -121,20 +121,20 @@ def points(calls: list[Call], sample: int | None) -> list[Point]:
     return [point for kind in kinds for point in kind]
 
 
-def trace(shim: Shim, work: Path, operations: Iterable[Operation], log: Path) -> None:
+def trace(work: Path, operations: Iterable[Operation], log: Path) -> None:
     """Run the operations once each, and log their calls. Who traces finds them by the names looked for."""
     with log.open("wb") as f:
         for operation in operations:
             _warm_up(operation)
-            _trace_one(shim, work / operation.name.replace(" ", "_"), operation, f)
+            _trace_one(work / operation.name.replace(" ", "_"), operation, f)
 
 
-def _trace_one(shim: Shim, folder: Path, operation: Operation, log: BinaryIO) -> None:
+def _trace_one(folder: Path, operation: Operation, log: BinaryIO) -> None:
     def act() -> None:
         log.write(f"begin {folder}\n".encode())
         log.flush()
         Path(f"{folder}.begin").exists()
-        shim.arm(folder, Mode.COUNT, log=log.fileno())
+        shim = Shim(folder, Mode.COUNT, log=log.fileno())
         operation.act(folder)
         shim.disarm()
         Path(f"{folder}.end").exists()
@@ -143,7 +143,7 @@ def _trace_one(shim: Shim, folder: Path, operation: Operation, log: BinaryIO) ->
     must(act)
 
 
-def _reference(shim: Shim, work: Path, operation: Operation) -> _Reference:
+def _reference(work: Path, operation: Operation) -> _Reference:
     home = work / operation.name
     home.mkdir()
     template, after = home / "before", home / "after"
@@ -153,9 +153,8 @@ def _reference(shim: Shim, work: Path, operation: Operation) -> _Reference:
     with log.open("wb") as f:
 
         def act() -> None:
-            shim.arm(after, Mode.COUNT, log=f.fileno())
+            Shim(after, Mode.COUNT, log=f.fileno())
             operation.act(after)
-            shim.disarm()
 
         must(act)
     return _Reference(
@@ -167,18 +166,13 @@ def _reference(shim: Shim, work: Path, operation: Operation) -> _Reference:
     )
 
 
-def _try(
-    shim: Shim, work: Path, operation: Operation, known: _Reference, point: Point, finding: Finding
-) -> None:
+def _try(work: Path, operation: Operation, known: _Reference, point: Point, finding: Finding) -> None:
     place = work / operation.name / "point"
     copy_tree(work / operation.name / "before", place)
 
     def act() -> None:
-        shim.arm(place, point.mode, point.at, point.error)
-        try:
-            operation.act(place)
-        finally:
-            shim.disarm()
+        Shim(place, point.mode, point.at, point.error)
+        operation.act(place)
 
     status, told = in_child(act)
     finding.points += 1
@@ -284,32 +278,24 @@ def _look_and_resume(folder: Path, operation: Operation) -> tuple[Units, Units, 
 # As a program, and how to start it --------------------------------------------------------------
 
 
-def run_campaign(names: Iterable[str], sample: int | None, library: Path) -> list[Finding]:
-    """The campaign over the named operations, or all, in a process with the shim."""
+def run_campaign(names: Iterable[str], sample: int | None) -> list[Finding]:
+    """The campaign over the named operations, or all, in a process of its own."""
     more = [] if sample is None else ["--sample", str(sample)]
-    done = start(library, [*more, *(f"--only={name}" for name in names)], stdout=subprocess.PIPE)
+    done = start([*more, *(f"--only={name}" for name in names)], stdout=subprocess.PIPE)
     return [Finding(**found) for found in json.loads(done.stdout)]
 
 
-def start(
-    library: Path, arguments: list[str], before: Iterable[str] = (), **how: Any
-) -> subprocess.CompletedProcess[str]:
-    """This program with the shim at `library`; `before` are words in front of it."""
-    command = [sys.executable, "-m", "tests.faults.crash_points_campaign", str(library), *arguments]
-    environment = {**os.environ, "LD_PRELOAD": str(library)}
+def start(arguments: list[str], before: Iterable[str] = (), **how: Any) -> subprocess.CompletedProcess[str]:
+    """This program; `before` are words in front of it."""
+    command = [sys.executable, "-m", "tests.faults.crash_points_campaign", *arguments]
     # Libraries that start threads when imported would not survive the forks.
-    environment |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    # Not for what stands in front, which starts it in its turn.
-    preload = ["env", f"LD_PRELOAD={environment.pop('LD_PRELOAD')}"] if before else []
-    return subprocess.run(
-        [*before, *preload, *command], cwd=REPOSITORY, env=environment, check=True, text=True, **how
-    )
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    return subprocess.run([*before, *command], cwd=REPOSITORY, env=environment, check=True, text=True, **how)
 
 
 def main() -> None:
     """Try the named operations, or all."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("library", type=Path)
     parser.add_argument("--sample", type=int, help="points of each kind of end, in place of all")
     parser.add_argument("--trace", type=Path, help="only run the operations, and log their calls there")
     parser.add_argument("--only", action="append", default=[], help="an operation")
@@ -318,9 +304,9 @@ def main() -> None:
     memory = Path("/dev/shm")  # copies there are quick; a kill is the same on every file system
     with tempfile.TemporaryDirectory(prefix="crash-points-", dir=memory if memory.is_dir() else None) as work:
         if options.trace:
-            trace(Shim(options.library), Path(work), chosen, options.trace)
+            trace(Path(work), chosen, options.trace)
             return
-        found = campaign(Shim(options.library), Path(work), chosen, options.sample)
+        found = campaign(Path(work), chosen, options.sample)
     json.dump([asdict(finding) for finding in found], sys.stdout)
 
 

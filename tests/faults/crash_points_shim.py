@@ -1,26 +1,24 @@
-"""The shim that ends or fails one call of a process: built by the C compiler, armed from Python."""
+"""Stands before the calls of `os` that change files, and ends or fails one of them below a folder."""
 
 from __future__ import annotations
 
-import ctypes
 import os
-import shutil
-import subprocess
+import signal
+from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import Enum, auto
 from pathlib import Path
+from typing import Any
 
-SOURCE = Path(__file__).with_name("crash_points_shim.c")
 
+class Mode(Enum):
+    """What happens at the chosen call."""
 
-class Mode(IntEnum):
-    """What happens at the chosen call. Numbers are those of the C file."""
-
-    KILL = 1  # before the call is made
-    KILL_HALF_WRITTEN = 2  # after half of the bytes of a write
-    FAIL_ONCE = 3
-    FAIL_FROM_HERE = 4  # every later call fails too that needs room on the disk
-    COUNT = 5  # nothing
+    KILL = auto()  # before the call is made
+    KILL_HALF_WRITTEN = auto()  # after half of the bytes of a write
+    FAIL_ONCE = auto()
+    FAIL_FROM_HERE = auto()  # every later call fails too that needs room on the disk
+    COUNT = auto()  # nothing
 
 
 @dataclass(frozen=True)
@@ -31,39 +29,66 @@ class Call:
     path: str
 
 
-def build(folder: Path) -> Path:
-    """The shim as a shared library in the folder. RuntimeError says why it cannot be had here."""
-    compiler = shutil.which(os.environ.get("CC", "cc"))
-    if compiler is None:
-        raise RuntimeError("no C compiler (cc) to build the shim with")
-    library = folder / "crash_points_shim.so"
-    command = [compiler, "-shared", "-fPIC", "-O1", "-Wall", "-Wextra", "-Werror"]
-    done = subprocess.run(
-        [*command, "-o", str(library), str(SOURCE), "-ldl"], capture_output=True, text=True, check=False
-    )
-    if done.returncode != 0:
-        raise RuntimeError(f"{compiler} cannot build the shim: {done.stderr.strip()[:500]}")
-    return library
-
-
 class Shim:
-    """The shim in this process, which must have been started with it in LD_PRELOAD."""
+    """Counts calls below `folder`, and does at number `at` (from 1) what the mode says. `log` is a file."""
 
-    def __init__(self, library: Path) -> None:
-        self._library = ctypes.CDLL(str(library))
-        loaded = ctypes.CDLL(None)
-        if not hasattr(loaded, "crash_points_arm"):
-            raise RuntimeError(f"{library} is not preloaded")
-
-    def arm(self, folder: Path, mode: Mode, at: int = 0, error: int = 0, log: int = -1) -> None:
-        """From now on count the calls below the folder; at number `at` (from 1) do what the mode says."""
-        self._library.crash_points_arm(
-            os.fsencode(folder), int(mode), ctypes.c_long(at), int(error), int(log)
-        )
+    def __init__(self, folder: Path, mode: Mode, at: int = 0, error: int = 0, log: int = -1) -> None:
+        self._folder, self._mode, self._at, self._error, self._log = folder, mode, at, error, log
+        self._calls = 0
+        self._write = os.write
+        os.open = self._opening(os.open)
+        os.write = self._writing(os.write)
+        for name in ("mkdir", "rename", "link", "unlink", "rmdir", "fsync"):
+            setattr(os, name, self._before(name, getattr(os, name)))
 
     def disarm(self) -> None:
         """Let all calls pass."""
-        self._library.crash_points_disarm()
+        self._folder = Path("/dev/null")
+
+    def _opening(self, real: Callable[..., int]) -> Callable[..., int]:
+        def call(path: Any, flags: int, mode: int = 0o777, *, dir_fd: int | None = None) -> int:
+            if flags & (os.O_CREAT | os.O_TRUNC | os.O_WRONLY | os.O_RDWR):
+                self._gate("open", bool(flags & os.O_CREAT), path, dir_fd)
+            return real(path, flags, mode, dir_fd=dir_fd)
+
+        return call
+
+    def _writing(self, real: Callable[..., int]) -> Callable[..., int]:
+        def call(fd: int, data: Any) -> int:
+            if self._gate("write", True, fd):
+                real(fd, data[: len(data) // 2])
+                os.kill(os.getpid(), signal.SIGKILL)
+            return real(fd, data)
+
+        return call
+
+    def _before(self, name: str, real: Callable[..., Any]) -> Callable[..., Any]:
+        def call(path: Any, *more: Any, **options: Any) -> Any:
+            folder = options.get("dir_fd", options.get("dst_dir_fd"))
+            # A link is the name that it makes.
+            self._gate(name, name not in ("unlink", "rmdir"), more[0] if name == "link" else path, folder)
+            return real(path, *more, **options)
+
+        return call
+
+    def _gate(self, kind: str, takes_room: bool, path: Any, dir_fd: int | None = None) -> bool:
+        """Count and log one call, and end or fail the chosen one; whether half of it is to be done."""
+        fd = path if isinstance(path, int) else dir_fd
+        base = Path.cwd() if fd is None else Path(f"/proc/self/fd/{fd}").readlink()
+        name = base if isinstance(path, int) else base / path
+        if name.is_relative_to(self._folder):
+            self._calls += 1
+            if self._log >= 0:
+                self._write(self._log, f"{kind} {name}\n".encode())
+            is_it = self._calls == self._at
+            if is_it and self._mode is Mode.KILL_HALF_WRITTEN and kind == "write":
+                return True
+            if is_it and self._mode in (Mode.KILL, Mode.KILL_HALF_WRITTEN):
+                os.kill(os.getpid(), signal.SIGKILL)
+            fails_on = self._mode is Mode.FAIL_FROM_HERE and self._calls >= self._at and takes_room
+            if fails_on or (is_it and self._mode is Mode.FAIL_ONCE):
+                raise OSError(self._error, os.strerror(self._error), name)
+        return False
 
 
 def read_log(text: str) -> list[Call]:
