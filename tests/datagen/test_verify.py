@@ -60,12 +60,10 @@ def test_damaged_shards_are_set_aside_and_made_again(
     told = capsys.readouterr().out
     for word in ("2 findings", "plans/1.json", "missing", "datagen verify --repair"):
         assert word in told
-    done = verified(copied, capsys, 0, "--repair", "--clean")["repaired"]
-    assert (done["restored"], done["set_aside"], done["sealed"]) == (
-        ["plans/1.json"],
-        ["commits/000000.json"],
-        True,
-    )
+    report = verified(copied, capsys, 1, "--repair", "--clean")
+    done, (left,) = report["repaired"], report["findings"]
+    assert (done["restored"], done["set_aside"]) == (["plans/1.json"], ["commits/000000.json"])
+    assert left["kind"] == "lost" and "datagen resume" in left["fix"]
     assert (copied / done["into"] / rows.relative_to(copied)).exists()
     assert cli.run(["resume", str(copied), *HERE]) == 0
     assert verified(copied, capsys, 0, "--replay", "3")["clean"]
@@ -79,7 +77,7 @@ def test_a_merged_run_is_repaired_and_resumed(
     assert cli.run(["merge", str(finished), "--out", str(out)]) == 0
     whole = arrays_of(out)
     object_of(out, 1).unlink()
-    assert verified(out, capsys, 0, "--repair")["repaired"]["set_aside"] == ["commits/000001.json"]
+    assert verified(out, capsys, 1, "--repair")["repaired"]["set_aside"] == ["commits/000001.json"]
     assert cli.run(["resume", str(out), *HERE]) == 0
     assert_equal_runs(arrays_of(out), whole)
     assert verified(out, capsys, 0)["clean"]

@@ -54,7 +54,8 @@ def test_zarr_and_xarray_read_rows_in_order_with_dimensions_units_and_licences(
     monkeypatch.setitem(SCHEMAS, "heuristic", FULL)
     houses, objects = Source(kind="procthor", digest="1" * 64), Source(kind="ycb", digest="2" * 64)
     spec = small_spec().model_copy(update={"houses": houses, "objects": objects})
-    run = make_run(tmp_path, n=43, shards=[4, 0, 2, 1, 3], spec=spec)
+    stated = {"houses_title": "My houses", "houses_licence": "CC0-1.0", "houses_attribution": "me"}
+    run = make_run(tmp_path, n=43, shards=[4, 0, 2, 1, 3], spec=spec, sources=stated)
     assert seal(run.storage) == f"{tmp_path}/data.zarr"
     wanted = expected(of(run, 0, 1, 2, 3, 4), 9, 43)
     with warnings.catch_warnings():
@@ -71,9 +72,9 @@ def test_zarr_and_xarray_read_rows_in_order_with_dimensions_units_and_licences(
     assert told["spec_hash"] == part["spec_hash"] == spec.hash() and part["specification"] == spec.document()
     assert (part["n"], part["samples"], part["missing"]) == (43, 43, [])
     assert told["Conventions"] == "CF-1.11, ACDD-1.3" and "datagen.candidates" in told["comment"]
-    assert told["title"] == "Robot base poses labelled by heuristic, in ProcTHOR houses with YCB objects"
-    assert told["license"] == "ProcTHOR houses: Apache-2.0; YCB objects: CC-BY-4.0"
-    assert "arXiv:2206.06994" in told["references"] and "Calli" in told["acknowledgement"]
+    assert told["title"] == "Robot base poses labelled by heuristic, in My houses with objects read as ycb"
+    assert told["license"] == "My houses: CC0-1.0; objects read as ycb: not stated"
+    assert told["references"] == "me" and told["acknowledgement"].startswith("My houses: me; ")
     assert f"objects ycb sha256 {'2' * 64}" in told["source"] and spec.hash() in told["history"]
     assert told["history"].startswith("datagen submit heuristic --n 43, seed 0")
 
