@@ -16,7 +16,6 @@ from datagen.schemas.run_records import QuarantineRecord
 from datagen.schemas.storage import open_storage
 from tests.made_runs import make_run
 
-MINE = "mine"
 NOBODY = 2**22 + 1  # beyond the largest number that a process can have
 
 
@@ -31,31 +30,23 @@ def record_of(started: datetime, pid: int, host: str = "") -> JobRecord:
     )
 
 
-@pytest.mark.parametrize(
-    ("pid", "host", "minutes", "health"),
-    [
-        # Its number is not a parameter: processes that share the tests would know them by other names.
-        (MINE, "", 0, "live"),
-        (MINE, "", 10, "live"),  # it is there, however long it says nothing
+def test_a_job_is_dead_when_it_is_silent_and_its_process_is_gone(tmp_path: Path) -> None:
+    jobs, at = Jobs(open_storage(tmp_path)), datetime.now(UTC)
+    for pid, host, minutes, health in (
+        (os.getpid(), "", 0, "live"),
+        (os.getpid(), "", 10, "live"),  # it is there, however long it says nothing
         (NOBODY, "", 0.5, "live"),  # not before a minute: hosts of one name are not one host
         (NOBODY, "", 2, "dead"),
         (1, "elsewhere", 0.5, "live"),
         (1, "elsewhere", 2, "silent"),
-    ],
-)
-def test_a_job_is_dead_when_it_is_silent_and_its_process_is_gone(
-    pid: int | str, host: str, minutes: float, health: str, tmp_path: Path
-) -> None:
-    jobs, at = Jobs(open_storage(tmp_path)), datetime.now(UTC)
-    record = record_of(at, os.getpid() if isinstance(pid, str) else pid, host)
-    jobs.begin(record)
-    heard = at - timedelta(minutes=minutes)
-    jobs.put_state(JobState(id=record.id, updated=heard.isoformat(), phase="making"))
-    (job,) = jobs.all()
-    assert job.health(at) == health
-    jobs.put_state(JobState(id=record.id, updated=heard.isoformat(), phase="ended", end="complete"))
-    (job,) = jobs.all()
-    assert job.health(at) == "ended"
+    ):
+        record = record_of(at, pid, host)
+        jobs.begin(record)
+        heard = (at - timedelta(minutes=minutes)).isoformat()
+        for end, expected in (("", health), ("complete", "ended")):
+            jobs.put_state(JobState(id=record.id, updated=heard, phase="making", end=end))  # type: ignore[arg-type]
+            job = jobs.get(record.id)
+            assert job is not None and job.health(at) == expected, (pid, minutes)
 
 
 def test_a_reused_process_number_is_not_the_job(tmp_path: Path) -> None:

@@ -113,7 +113,7 @@ SOURCES = st.lists(
 )
 
 
-@settings(max_examples=15, phases=[Phase.explicit, Phase.reuse, Phase.generate])
+@settings(max_examples=10, phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(sources=SOURCES, more=st.integers(1, 9))
 @example(sources=[(6, {0}, 12), (2, {4}, 12)], more=1)  # a scene in the middle of a shard that is missing
 @example(sources=[(6, {0}, 24), (5, {1}, 24), (4, {1, 2, 4}, 24)], more=5)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 
 import pytest
 from obstore.exceptions import GenericError
@@ -24,7 +25,7 @@ def behind(bucket: str, s3_port: int, monkeypatch: pytest.MonkeyPatch) -> Behind
     """A storage behind a proxy with faults."""
 
     @contextmanager
-    def open_behind(faults: Faults) -> Iterator[Storage]:
+    def open_behind(faults: Faults) -> Generator[Storage]:
         with faulty_proxy(s3_port, faults) as port:
             for name, value in environment(port).items():
                 monkeypatch.setenv(name, value)
@@ -34,9 +35,11 @@ def behind(bucket: str, s3_port: int, monkeypatch: pytest.MonkeyPatch) -> Behind
     return open_behind
 
 
-def test_of_racing_writers_exactly_one_wins(behind: Behind):
-    with behind(Faults()) as s:
-        for round_ in range(5):
+@pytest.mark.parametrize("kind", ["disk", "s3"])
+def test_of_racing_writers_exactly_one_wins_and_its_bytes_stay(kind: str, behind: Behind, tmp_path: Path):
+    with behind(Faults()) as remote:
+        s = open_storage(tmp_path) if kind == "disk" else remote
+        for round_ in range(8):
             barrier = threading.Barrier(4)
 
             def race(me: int, key: str = f"c/{round_}", barrier: threading.Barrier = barrier) -> bool:
@@ -47,6 +50,7 @@ def test_of_racing_writers_exactly_one_wins(behind: Behind):
                 won = list(pool.map(race, range(4)))
             assert sum(won) == 1
             assert s.get(f"c/{round_}", 5000) == b"%d" % won.index(True) * 1000
+        assert sorted(file.key for file in s.list("")) == [f"c/{i}" for i in range(8)]
 
 
 def test_what_was_done_and_answered_by_an_error_is_done(behind: Behind):
@@ -116,7 +120,7 @@ def test_a_store_that_is_down_is_told_within_the_bound(behind: Behind, monkeypat
 
 
 @contextmanager
-def answering(answer: bytes | None) -> Iterator[int]:
+def answering(answer: bytes | None) -> Generator[int]:
     """A port where every connection gets this answer, or none."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         held: list[socket.socket] = []
