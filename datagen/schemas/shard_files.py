@@ -64,7 +64,7 @@ def _chunks_per_file(schema: RecordSchema, field: Field, step: int, rows: int) -
 
 def chunk_key(field: Field, index: int) -> str:
     """Name of a field's chunk: its index along the rows, and 0 along the field's own axes."""
-    return ".".join(["c", str(index), *("0" for _ in field.dims)])
+    return f"c.{index}{'.0' * len(field.dims)}"
 
 
 def chunk_paths(schema: RecordSchema, layout: Layout, table: Table, field: Field) -> tuple[str, ...]:

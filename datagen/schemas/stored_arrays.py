@@ -131,7 +131,7 @@ def decode_chunk(place: str, array: StoredArray, data: bytes) -> Array:
 
 def chunk_path(array: StoredArray, index: int) -> str:
     """Path of a chunk, or of a file of chunks."""
-    return f"{array.name}/" + ".".join(["c", str(index), *("0" for _ in array.shape[1:])])
+    return f"{array.name}/c.{index}{'.0' * len(array.shape[1:])}"
 
 
 def _content_bytes(frame: bytes) -> int:

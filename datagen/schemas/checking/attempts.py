@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
 
 from datagen.schemas.checking.finding import BACKUP, Finding, Kind, Restore, SetAside, curable, read
 from datagen.schemas.quarantine import name_before
@@ -28,8 +27,6 @@ from datagen.schemas.run_records import (
     foreign_field,
     other_value,
 )
-
-Ledgered = TypeVar("Ledgered", AttemptStart, LedgerEntry)
 
 _ROUNDING = 1e-6
 _ROUNDING_S = 1e-3  # clocks are rounded to milliseconds

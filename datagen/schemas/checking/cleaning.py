@@ -84,19 +84,19 @@ def _clean_rest(storage: Storage, before_s: float, cleaned: Cleaned) -> None:
     """Remove drafts, probes, and sealed stores that do not count and are not being written."""
     record = store_record(storage)
     files = [file for file in storage.list("") if not file.key.startswith("parts/")]
-    newest_s: dict[str, float] = {}
-    for file in files:
-        newest_s[_store_of(file)] = max(newest_s.get(_store_of(file), 0.0), file.modified_s)
-    stores = {name for name, newest in newest_s.items() if name and newest < before_s}
-    stores -= {record.name} if record else set()
-    leftovers = (
+    kept = {
+        record.name if record else "",
+        "",
+        *(_store_of(file) for file in files if file.modified_s >= before_s),
+    }
+    old = [
         file
         for file in files
-        if file.modified_s < before_s and (_PROBE.match(file.key) or _DRAFT.fullmatch(file.key))
-    )
-    _remove(storage, [file for file in files if _store_of(file) in stores], cleaned)
-    _remove(storage, [file for file in leftovers if _store_of(file) not in stores], cleaned)
-    for name in sorted(stores):
+        if file.modified_s < before_s
+        and (_store_of(file) not in kept or _PROBE.match(file.key) or _DRAFT.fullmatch(file.key))
+    ]
+    _remove(storage, old, cleaned)
+    for name in sorted({_store_of(file) for file in old} - kept):
         storage.remove_empty(name)
 
 

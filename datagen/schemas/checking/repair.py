@@ -155,7 +155,8 @@ def _reseal(storage: Storage, result: Repaired) -> bool:
             else:
                 result.resealed = True
                 has_labels = label_counts(runs).labels > 0
-                _forget_store(storage, is_damaged="sealed" in kinds)
+                if "sealed" in kinds:  # an undamaged store is replaced once the new one is written
+                    _forget_store(storage)
                 if has_labels:
                     seal(storage)
                 return result.checked.is_sealed or has_labels
@@ -169,10 +170,8 @@ def _reseal(storage: Storage, result: Repaired) -> bool:
     return False
 
 
-def _forget_store(storage: Storage, is_damaged: bool) -> None:
-    """Remove a store that is damaged: an undamaged one is replaced once the new one is written."""
-    if not is_damaged:
-        return
+def _forget_store(storage: Storage) -> None:
+    """Remove a damaged store, its record first."""
     record = None
     with suppress(InputError):  # its record is damaged
         record = store_record(storage)

@@ -120,7 +120,10 @@ def merge_runs(
         run = _begin(part, plan, storage if is_one else storage.below(part.folder))
         written.append(_write(part, run, tick))
     if not is_one:
-        _replace(storage, MERGED, encode_record(Merged(parts=merge.scenes)))
+        record = encode_record(Merged(parts=merge.scenes))
+        for key in (copy_key(MERGED), MERGED):
+            if storage.get(key, MAX_RECORD_BYTES) != record:
+                storage.put(key, record)
     has_labels = label_counts(open_runs(storage)).labels > 0
     return MergeResult(storage, tuple(written), seal(storage, sealing) if has_labels else "")
 
@@ -187,13 +190,6 @@ def _end_of_spare(source: Run, commit: Commit) -> LedgerEntry:
         cost=commit.cost,
         host=commit.host,
     )
-
-
-def _replace(storage: Storage, key: str, record: bytes) -> None:
-    """Write a record that may change, its copy first; unchanged ones are not written."""
-    for name in (copy_key(key), key):
-        if storage.get(name, MAX_RECORD_BYTES) != record:
-            storage.put(name, record)
 
 
 def _existing_storage(out: str) -> Storage | None:

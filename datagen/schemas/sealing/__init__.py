@@ -21,6 +21,7 @@ from zarr.storage import MemoryStore
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import TABLES
 from datagen.schemas.record_files import encode_record
+from datagen.schemas.run import open_runs
 from datagen.schemas.run_records import FileEntry
 from datagen.schemas.sealing.array_files import ArrayFiles
 from datagen.schemas.sealing.contents import (
@@ -29,7 +30,7 @@ from datagen.schemas.sealing.contents import (
     Contents,
     SealedPart,
     StoreRecord,
-    contents_of,
+    read_contents,
     store_record,
 )
 from datagen.schemas.shard_files import cf_attributes, described, root_attributes, zarr_metadata
@@ -52,7 +53,7 @@ def seal(storage: Storage, tick: Tick = lambda done, total: None) -> str:
     called with the number of shards written, and of all. InputError when no shard is committed, a shard is
     missing or damaged, merged runs have different arrays, or the disk or the server fails.
     """
-    contents = contents_of(storage)
+    contents = read_contents(open_runs(storage))
     old = store_record(storage)
     digest, parts = contents.digest(), contents.parts()
     if old is not None and (old.rows_sha256, old.parts) == (digest, parts):

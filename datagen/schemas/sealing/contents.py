@@ -11,7 +11,7 @@ from pydantic import Field
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import RecordSchema, Table
 from datagen.schemas.record_files import read_record
-from datagen.schemas.run import Rows, Run, open_runs
+from datagen.schemas.run import Rows, Run
 from datagen.schemas.run_records import (
     FORMAT_VERSION,
     Commit,
@@ -122,7 +122,10 @@ def read_contents(runs: Sequence[Run]) -> Contents:
     first = runs[0]
     for run in runs[1:]:
         _refuse_other_arrays(first, run)
-    held = [(run, n := run.n, _commits(run, n)) for run in runs]
+    held: list[tuple[Run, int, tuple[Commit, ...]]] = []
+    for run in runs:
+        planned = run.planned(n := run.n)
+        held.append((run, n, tuple(commit for commit in run.commits() if commit.shard in planned)))
     last = max((k for k, (_, _, commits) in enumerate(held) if commits), default=None)
     if last is None:
         place = first.storage.url
@@ -130,16 +133,6 @@ def read_contents(runs: Sequence[Run]) -> Contents:
     sealed = tuple(SealedRun(run, n, commits, k == last) for k, (run, n, commits) in enumerate(held))
     layout = max((run.layout for run in runs), key=lambda layout: layout.scenes_per_shard)
     return Contents(sealed, first.schema, layout)
-
-
-def contents_of(storage: Storage) -> Contents:
-    """The content of a store over the run, or merged runs, in `storage`. InputError as `read_contents`."""
-    return read_contents(open_runs(storage))
-
-
-def _commits(run: Run, n: int) -> tuple[Commit, ...]:
-    planned = run.planned(n)
-    return tuple(commit for commit in run.commits() if commit.shard in planned)
 
 
 def _refuse_other_arrays(first: Run, run: Run) -> None:
