@@ -221,17 +221,12 @@ def test_runs_of_several_specifications_become_parts(tmp_path: Path) -> None:
 def test_hostile_records_of_merged_runs_are_refused(tmp_path: Path) -> None:
     storage, second = open_storage(tmp_path), {"folder": "parts/b", "spec_hash": "0" * 64, "scenes": []}
     for changes in (
-        *(
-            {"scenes": scenes}
-            for scenes in ([[5, 2]], [[0, 4], [2, 6]], [[3, 3]], [[0, 10**19]], [[-1, 2]], 3)
-        ),
+        *({"scenes": odd} for odd in ([[5, 2]], [[0, 4], [2, 6]], [[3, 3]], [[0, 10**19]], [[-1, 2]], 3)),
         *({"folder": folder} for folder in ("../a", "/etc", "")),
         {"spec_hash": "x"},
     ):
-        record = {
-            "format_version": FORMAT_VERSION,
-            "parts": [second | {"folder": "parts/a"} | changes, second],
-        }
+        parts = [second | {"folder": "parts/a"} | changes, second]
+        record = {"format_version": FORMAT_VERSION, "parts": parts}
         storage.put(MERGED, signed_json(record))
         with pytest.raises(InputError, match=r"merged\.json: parts\.0"):
             open_runs(storage)
@@ -247,19 +242,18 @@ def test_an_interrupted_merge_is_completed_by_the_same_command(tmp_path: Path) -
     for who, seed, size in (("a", 0, 2), ("b", 0, 2), ("c", 1, 2), ("d", 1, 3)):
         fill(tmp_path, who, [0, 1, 2], seed=seed, size=size)
     merge(tmp_path, "abcd", "undisturbed")
-    made, at = 10**6, 1
-    while made >= at:
+    plain, at, was_killed = whole(tmp_path / "undisturbed"), 1, True
+    while was_killed:
         out = f"0{at}"  # first by name, where it would be taken for the shards' origin
-        with pytest.MonkeyPatch.context() as patch:
+        with pytest.MonkeyPatch.context() as patch, suppress(Killed):
             changes = Changes(patch, dies_at(at))
-            with suppress(Killed):
-                merge(tmp_path, "abcd", out)
-        made, at = changes.made, at + 5
+            merge(tmp_path, "abcd", out)
+        was_killed, at = changes.made >= at, at + 5
         merge(tmp_path, "abcd", out)
-        assert {k: v for k, v in whole(tmp_path / out).items() if "data" not in k} == {
-            k: v for k, v in whole(tmp_path / "undisturbed").items() if "data" not in k
-        }, at
+        there = whole(tmp_path / out)
+        assert all(there[key] == data for key, data in plain.items() if not key.startswith("data")), at
         assert_rows(stored(open_storage(tmp_path / out)), stored(open_storage(tmp_path / "undisturbed")))
+        assert found(tmp_path / out) == []
 
 
 def test_merges_on_s3_give_the_same_files(tmp_path: Path, bucket: str) -> None:
@@ -345,12 +339,7 @@ def flips(*rows: int) -> Change:
     ("ours", "theirs", "row", "field"),
     [
         (None, flips(6, 9), 6, "label"),  # the first sample
-        (
-            None,
-            lambda t: (flips(2)(t), sets("distance_m", 2, 0.5)(t)),
-            2,
-            "distance_m",
-        ),  # the schema's first field
+        (None, lambda t: (flips(2)(t), sets("distance_m", 2, 0.5)(t)), 2, "distance_m"),  # the first field
         (None, sets("house_id", 1, "another"), 5, "house_id"),
         (None, sets("redraws", 1, 7), 5, "redraws"),
         (sets("distance_m", 3, 0.0), sets("distance_m", 3, -0.0), 3, "distance_m"),  # bit for bit
@@ -362,9 +351,7 @@ def test_other_rows_are_refused_naming_the_first_sample_and_field(
     one = changed(tmp_path, "a", 0, ours)
     changed(tmp_path, "b", 0, theirs)
     sample = rows_of(one, 0)[1]["sample_id"][row].tobytes().hex()
-    told = (
-        f"a: shard 0: {tmp_path}/b has other rows, first in sample {sample}, in {field}. Run `datagen verify`"
-    )
+    told = f"a: shard 0: {tmp_path}/b has other rows, first in sample {sample}, in {field}. "
     with pytest.raises(InputError) as refused:
         merge(tmp_path, "ab")
     assert told in str(refused.value) and not (tmp_path / "out").exists()
@@ -373,8 +360,7 @@ def test_other_rows_are_refused_naming_the_first_sample_and_field(
 def test_equal_rows_in_other_bytes_are_no_conflict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one = changed(tmp_path, "a", 0)
     monkeypatch.setattr("datagen.schemas.shard_files.ZSTD_LEVEL", 19)  # as another version of the compressor
-    other = changed(tmp_path, "b", 0)
-    assert one.commit_of(0).object.sha256 != other.commit_of(0).object.sha256
+    assert changed(tmp_path, "b", 0).commit_of(0).object.sha256 != one.commit_of(0).object.sha256
     merge(tmp_path, "ab")
     assert Run.open(tmp_path / "out").commit_of(0).attempt == "a"
 
@@ -386,9 +372,7 @@ def test_every_common_scene_of_shards_of_other_sizes_is_compared_and_no_other(tm
         refuse_different_rows(small, 1, large, 0)
         refuse_different_rows(large, 0, small, 1)
     changed(tmp_path, "odd", 0, flips(15), 4)
-    with pytest.raises(
-        InputError, match=r"odd: shard 0: .*small has other rows, first in sample .*, in label"
-    ):
+    with pytest.raises(InputError, match=r"odd: shard 0: .*small has other rows, first .*, in label"):
         merge(tmp_path, ["small", "odd"])
     # Of three sizes: scene 7 is in b and c, whose first common scene is in a too.
     changed(tmp_path, "a", 0, None, 6)

@@ -31,7 +31,7 @@ from tests.schemas.checked import (
     sealed_run,
     stored,
     tree,
-)
+)  # fmt: skip
 
 pytestmark = pytest.mark.usefixtures("few_arrays")
 
