@@ -172,19 +172,27 @@ class Killed(BaseException):
 
 
 class Changes:
-    """Counts the changes that a thread makes to storages; `before` is called before each."""
+    """Counts the changes of storages while it is open; `before` is called before each."""
 
-    def __init__(self, patch: pytest.MonkeyPatch, before: Callable[[int], None]) -> None:
-        self.made = 0
+    def __init__(self, before: Callable[[int], None]) -> None:
+        self.made, self._before, self._patch = 0, before, pytest.MonkeyPatch()
+
+    def __enter__(self) -> Changes:
         for name in ("put", "put_new", "delete", "remove_empty"):
-            plain = getattr(Storage, name)
+            self._patch.setattr(Storage, name, self._counted(getattr(Storage, name)))
+        return self
 
-            def change(storage: Storage, *arguments: Any, plain: Callable[..., Any] = plain) -> Any:
-                self.made += 1
-                before(self.made)
-                return plain(storage, *arguments)
+    def __exit__(self, *_: object) -> bool:
+        self._patch.undo()
+        return isinstance(_[1], Killed)
 
-            patch.setattr(Storage, name, change)
+    def _counted(self, plain: Callable[..., Any]) -> Callable[..., Any]:
+        def change(*arguments: Any, **options: Any) -> Any:
+            self.made += 1
+            self._before(self.made)
+            return plain(*arguments, **options)
+
+        return change
 
 
 def dies_at(number: int) -> Callable[[int], None]:

@@ -45,8 +45,9 @@ def littered(folder: Path | str) -> tuple[Run, set[str]]:
 
 
 def age(run: Run, keys: Iterable[str], seconds: float) -> None:
+    then_s = time.time() - seconds
     for key in keys:
-        os.utime(folder_of(run) / key, (time.time() - seconds,) * 2)
+        os.utime(folder_of(run) / key, (then_s, then_s))
 
 
 def without(storage: Storage, garbage: Iterable[str]) -> dict[str, bytes | None]:

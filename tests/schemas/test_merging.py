@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ from tests.made_runs import Tables, attempt, files_of, make_run, manifest_of, ro
 from tests.schemas.checked import (
     Arrays,
     Changes,
-    Killed,
     assert_rows,
     commit_object,
     dies_at,
@@ -245,8 +243,7 @@ def test_an_interrupted_merge_is_completed_by_the_same_command(tmp_path: Path) -
     plain, at, was_killed = whole(tmp_path / "undisturbed"), 1, True
     while was_killed:
         out = f"0{at}"  # first by name, where it would be taken for the shards' origin
-        with pytest.MonkeyPatch.context() as patch, suppress(Killed):
-            changes = Changes(patch, dies_at(at))
+        with Changes(dies_at(at)) as changes:
             merge(tmp_path, "abcd", out)
         was_killed, at = changes.made >= at, at + 5
         merge(tmp_path, "abcd", out)

@@ -6,7 +6,6 @@ import json
 import subprocess
 import threading
 import warnings
-from contextlib import suppress
 from pathlib import Path
 
 import google_crc32c
@@ -30,7 +29,6 @@ from tests.made_runs import attempt, files_of, make_run, manifest_of, small_spec
 from tests.schemas.checked import (
     FULL,
     Changes,
-    Killed,
     assert_rows,
     dies_at,
     edit,
@@ -222,8 +220,7 @@ def test_a_killed_seal_leaves_the_old_store_or_the_new_one(place: str, tmp_path:
     while was_killed:
         assert attempt(run, shards, f"a-{shards}")
         old, shards = store_record(storage), shards + 1
-        with pytest.MonkeyPatch.context() as patch, suppress(Killed):
-            changes = Changes(patch, dies_at(at))
+        with Changes(dies_at(at)) as changes:
             seal(storage)
         record = store_record(storage)
         seen.add("none" if record is None else "old" if record == old else "new")
@@ -284,8 +281,7 @@ def test_seals_at_the_same_time_leave_a_whole_store_in_any_order(
         finally:
             turns.end()
 
-    with pytest.MonkeyPatch.context() as patch:
-        Changes(patch, lambda made: turns.wait(names[threading.get_ident()]))
+    with Changes(lambda made: turns.wait(names[threading.get_ident()])):
         threads = [threading.Thread(target=act, args=(k,)) for k in range(3)]
         for thread in threads:
             thread.start()

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -69,26 +67,6 @@ def test_many_files_come_back_in_order(place: str):
         list(s.get_many(files, 1))
     s.delete(files)
     assert list(s.list("k")) == []
-
-
-def test_of_racing_processes_exactly_one_wins(tmp_path: Path):
-    code = (
-        "import sys; from datagen.schemas.storage import open_storage\n"
-        "s = open_storage(sys.argv[1], probe=False)\n"
-        "sys.stdin.readline(); print(sum(s.put_new(f'c/{i}', sys.argv[2].encode()) for i in range(40)))"
-    )
-    command, pipe = [sys.executable, "-c", code, str(tmp_path)], subprocess.PIPE
-    racers = [
-        subprocess.Popen(
-            [*command, str(i)], stdin=pipe, stdout=pipe, text=True, cwd=Path(__file__).parents[2]
-        )
-        for i in range(2)
-    ]
-    for r in racers:
-        assert r.stdin
-        r.stdin.write("go\n")
-        r.stdin.flush()
-    assert sum(int(r.communicate()[0]) for r in racers) == len(files_of(tmp_path)) == 40
 
 
 def test_a_full_disk_is_one_line_and_leaves_nothing_visible(tiny_disk: Path):

@@ -150,15 +150,6 @@ def test_sound_runs_have_no_findings_and_their_numbers_are_reported(
     assert found(tmp_path / "empty") == []
 
 
-def test_places_without_a_run_and_other_formats_are_refused(sealed: Run, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="not a run"):
-        check(tmp_path)
-    for key in ("manifest.json", "copies/manifest.json"):
-        edit(folder_of(sealed) / key, format_version=99)
-    with pytest.raises(InputError, match="99"):
-        check(folder_of(sealed))
-
-
 # Root records --------------------------------------------------------------------------------
 
 
@@ -171,10 +162,8 @@ def test_signed_records_that_differ_from_their_copies_or_in_form_are_found(seale
     del record["sha256"]
     path.write_bytes(signed_json(dict(reversed(record.items()))))
     findings, _ = check(folder)
-    assert [(f.kind, f.key) for f in findings] == [
-        ("record", "manifest.json"), ("record", "plans/1.json"), ("account", "ledger/x-1.json"),
-    ]  # fmt: skip
-    assert [f.cure is None for f in findings] == [True, True, False]
+    keys = ["manifest.json", "plans/1.json", "ledger/x-1.json"]
+    assert [(f.key, f.cure is None) for f in findings] == list(zip(keys, (True, True, False), strict=True))
 
 
 def test_plans_that_are_gone_or_shrink(tmp_path: Path) -> None:
@@ -194,10 +183,15 @@ def test_plans_that_are_gone_or_shrink(tmp_path: Path) -> None:
     assert found(folder) == [("record", "plans/2.json")]
 
 
-def test_a_missing_part_of_merged_runs_is_found(merged: Path) -> None:
+def test_missing_parts_and_runs_and_other_formats_are_found_or_refused(merged: Path, sealed: Run) -> None:
     part = min((merged / "parts").iterdir())
     shutil.rmtree(part)
     assert ("record", f"parts/{part.name}/manifest.json") in found(merged) and not part.exists()
+    for key in ("manifest.json", "copies/manifest.json"):
+        edit(folder_of(sealed) / key, format_version=99)
+    for place, problem in ((merged.parent, "not a run"), (folder_of(sealed), "99")):
+        with pytest.raises(InputError, match=problem):
+            check(place)
 
 
 def test_a_torn_state_of_a_job_is_no_finding_and_a_damaged_job_is(sealed: Run) -> None:
@@ -216,13 +210,15 @@ def test_a_torn_state_of_a_job_is_no_finding_and_a_damaged_job_is(sealed: Run) -
 # Commits, objects and stores -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "changes", [{"shard": 0}, {"spec_hash": "0" * 64}, {"scenes": 1}, {"samples": 3}, {"format_version": "x"}]
-)
-def test_a_commit_that_cannot_be_this_shards_is_set_aside(sealed: Run, changes: dict[str, Any]) -> None:
-    edit(folder_of(sealed) / commit_key(1), **changes)
-    finding = next(f for f in check(folder_of(sealed))[0] if f.kind == "record")
-    assert (finding.key, finding.shard) == (commit_key(1), 1) and isinstance(finding.cure, SetAside)
+def test_a_commit_that_cannot_be_this_shards_is_set_aside(sealed: Run) -> None:
+    path = folder_of(sealed) / commit_key(1)
+    whole = path.read_bytes()
+    changes = ({"shard": 0}, {"spec_hash": "0" * 64}, {"scenes": 1}, {"samples": 3}, {"format_version": "x"})
+    for change in changes:
+        edit(path, **change)
+        finding = next(f for f in check(folder_of(sealed))[0] if f.kind == "record")
+        assert (finding.key, finding.shard) == (commit_key(1), 1) and isinstance(finding.cure, SetAside)
+        path.write_bytes(whole)
 
 
 def test_files_that_no_record_names_are_foreign_or_of_the_store(sealed: Run) -> None:
@@ -349,7 +345,8 @@ def test_stages_that_take_longer_than_their_attempt(sealed: Run) -> None:
             ({"stage_wall_s": {"draw": 1.6, "settle": 0.6}}, "stage_wall_s: the stages sum to 2.2 s"),
             ({"stage_cpu_s": {"draw": 2.5}}, "stage_cpu_s: the stages sum to 2.5 s"),
         ):
-            edit(folder_of(sealed) / key, cost=Cost(wall_s=2, cpu_s=2, **stages).model_dump(mode="json"))
+            cost = Cost.model_validate({"wall_s": 2.0, "cpu_s": 2.0, **stages})
+            edit(folder_of(sealed) / key, cost=cost.model_dump(mode="json"))
             findings, _ = check(folder_of(sealed))
             assert [(f.key, f.cure) for f in findings] == ([(key, None)] if problem else [])
             assert all(problem in f.problem for f in findings)
