@@ -30,8 +30,8 @@ from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal, store_record
 from datagen.schemas.storage import open_storage
 from tests.cluster.simulated import Heard
-from tests.faults.counted import SAMPLES_PER_SHARD, count
-from tests.faults.s3_campaign import LAYOUT, Rows, make_rows
+from tests.faults.counted import SAMPLES_PER_SHARD, CountedRows, count, make_counted
+from tests.faults.crash_points_operations import LAYOUT
 from tests.made_runs import manifest_of, small_spec
 
 _SHUTDOWN, _NO_LOG_FLUSH = 0x8004587D, 2  # EXT4_IOC_SHUTDOWN of linux/ext4.h, and its flag
@@ -40,10 +40,10 @@ _FORKS = multiprocessing.get_context("forkserver")
 _FORKS.set_forkserver_preload(["tests.faults.power_cut_campaign"])
 
 
-def make_durable(task: Rows, meter: Meter) -> AttemptResult:
+def make_durable(task: CountedRows, meter: Meter) -> AttemptResult:
     """Make and commit the shard, and note it once its commit is said to be durable."""
-    result = make_rows(replace(task, executions=os.devnull), meter)
-    count(task.executions, "committed", str(task.shard))
+    result = make_counted(replace(task, counted=os.devnull), meter)
+    count(task.counted, "committed", str(task.shard))
     return result
 
 
@@ -53,7 +53,8 @@ def job(folder: str, noted: str, shards: int) -> None:
     try:
         _make(folder, noted, shards)
     except InputError as error:  # the disk is gone
-        sys.exit(f"error: {error}" * ("Input/output error" not in error.problem) or 2)
+        is_gone = error.problem in ("Input/output error", "Read-only file system")
+        sys.exit(2 if is_gone else f"error: {error}")
 
 
 def _make(folder: str, noted: str, shards: int) -> None:
@@ -65,8 +66,8 @@ def _make(folder: str, noted: str, shards: int) -> None:
     def on_tick(totals: JobTotals) -> None:
         jobs.put_state(JobState(id=name, updated=utc_now(), phase="making", done=totals.committed))
 
-    def make_task(order: AttemptOrder) -> Rows:
-        return Rows(folder, noted, order.shard, order.attempt, order.deadline_s)
+    def make_task(order: AttemptOrder) -> CountedRows:
+        return CountedRows(folder, noted, 0, False, order.shard, order.attempt, order.deadline_s, "")
 
     for step in range(1, _STEPS + 1):
         run.grow(step * per_step)

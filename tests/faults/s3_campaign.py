@@ -6,10 +6,9 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from datagen.cluster.attempt_guard import Meter
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
-from datagen.cluster.protocol import AttemptResult, StopRequest
+from datagen.cluster.protocol import StopRequest
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.checking.check_runs import Checked, check_runs
@@ -20,33 +19,12 @@ from datagen.schemas.run_records import FileEntry, Layout
 from datagen.schemas.sealing import seal, store_record
 from datagen.schemas.storage import open_storage
 from tests.cluster.simulated import Heard
-from tests.made_runs import make_run, manifest_of, small_spec, write
+from tests.faults.counted import CountedRows, executions, make_counted
+from tests.made_runs import make_run, manifest_of, small_spec
 from tests.s3_servers import Faults
 
 _COUNTS = ("requests", "pass", "commits", "creates")
 LAYOUT = Layout(scenes_per_shard=2, candidates_per_scene=5)
-
-
-@dataclass(frozen=True)
-class Rows:
-    """A shard of random rows, and the file that counts its executions."""
-
-    run: str
-    executions: str
-    shard: int
-    attempt: str
-    deadline_s: float
-    notes: str = ""
-
-
-def make_rows(task: Rows, meter: Meter) -> AttemptResult:
-    """Write and commit the shard; a line in the file for each execution that the ledger knows of."""
-    run = Run.open(task.run)
-    run.ledger.start(task.attempt, task.shard)
-    with Path(task.executions).open("a") as f:
-        f.write(f"{task.attempt}\n")
-    commit = write(run, task.shard, task.attempt).model_copy(update={"cost": meter.cost()})
-    return AttemptResult(run.commit(commit), commit.samples, commit.positives, commit.cost)
 
 
 @dataclass(frozen=True)
@@ -66,14 +44,14 @@ def campaign(address: str, shards: int, faults: Faults, folder: Path) -> Outcome
     A job that ends with an InputError is begun again, and the store is up again by then. Raises
     AssertionError where the run then is not what an undisturbed one is.
     """
-    executions = folder / "executions"
-    executions.touch()
+    counted = folder / "executions"
+    counted.touch()
     jobs = 0
     while True:
         jobs += 1
         assert jobs < 50, "the store recovers, and still the job does not end"
         try:
-            run = _job(address, shards, str(executions))
+            run = _job(address, shards, str(counted))
             if not run.missing():
                 seal(run.storage)
                 break
@@ -83,36 +61,35 @@ def campaign(address: str, shards: int, faults: Faults, folder: Path) -> Outcome
     # The rest is looking.
     faults.error = faults.lost_answer = faults.hold = faults.cut = 0.0
     faults.lost_creates, faults.down_after, faults.down_at_commits = 0, [], []
-    _hold_to_ledger(run, executions.read_text().split())
+    begun = executions(counted).begun
+    _hold_to_ledger(run, begun)
     _hold_to_an_undisturbed_run(run, shards, folder / "undisturbed")
     counts = Counter({kind: count for kind, count in seen.items() if kind not in _COUNTS})
-    lines = len(executions.read_text().split())
-    return Outcome(shards, jobs, lines, seen["requests"], counts)
+    return Outcome(shards, jobs, len(begun), seen["requests"], counts)
 
 
-def _job(address: str, shards: int, executions: str) -> Run:
+def _job(address: str, shards: int, counted: str) -> Run:
     manifest = manifest_of(small_spec(), LAYOUT)
     run = Run.create_or_open(open_storage(address), manifest, shards * LAYOUT.samples_per_shard)
 
-    def make_task(order: AttemptOrder) -> Rows:
-        return Rows(address, executions, order.shard, order.attempt, order.deadline_s)
+    def make_task(order: AttemptOrder) -> CountedRows:
+        return CountedRows(address, counted, 0, False, order.shard, order.attempt, order.deadline_s, "")
 
-    policy, executor = RetryPolicy(), InProcessExecutor(make_rows)
+    policy, executor = RetryPolicy(), InProcessExecutor(make_counted)
     drive(run.missing(), make_task, executor, RunRecorder(run), policy, Heard(), StopRequest())
     close_lost_attempts(run)
     return run
 
 
-def _hold_to_ledger(run: Run, executions: list[str]) -> None:
+def _hold_to_ledger(run: Run, begun: set[str]) -> None:
     """Every execution is in the ledger once, with a commit or an end; every shard was committed once."""
-    assert len(executions) == len(set(executions))
     assert not run.quarantined() and not run.missing()
     commits = {commit.attempt: commit for commit in run.commits()}
     assert [commit.shard for commit in commits.values()] == list(run.planned())
     ends = {entry.attempt: entry for entry in run.ledger.ends()}
     keys = {file.key.removeprefix("ledger/") for file in run.storage.list("ledger")}
     starts = {key.removesuffix(".start.json") for key in keys if key.endswith(".start.json")}
-    assert set(executions) <= starts == ends.keys() | commits.keys()
+    assert begun <= starts == ends.keys() | commits.keys()
     assert all(is_guess(ends[attempt]) for attempt in ends.keys() & commits.keys())
 
 

@@ -153,9 +153,8 @@ def _write(part: Part, run: Run, tick: Tick) -> WrittenPart:
 
     for _ in storage.concurrent_map(copy, new):
         tick()
-    for source in part.runs:
-        if identity(source) != identity(run):
-            _copy_records(source, run, {end_key(commit.attempt) for _, commit in part.kept.values()})
+    others = [source for source in part.runs if identity(source) != identity(run)]
+    _copy_records(others, run, {end_key(commit.attempt) for _, commit in part.kept.values()})
     for source, commit in part.spare:
         if run.commit_of(commit.shard).attempt != commit.attempt:
             run.ledger.end(_end_of_spare(part.runs[source], commit))
@@ -163,19 +162,32 @@ def _write(part: Part, run: Run, tick: Tick) -> WrittenPart:
     return WrittenPart(run, len(there), len(new), len(part.spare))
 
 
-def _copy_records(source: Run, run: Run, but: Container[str]) -> None:
-    """Copy the ledger, but for some keys, and the quarantine of shards that are not committed."""
+def _copy_records(sources: Sequence[Run], run: Run, but: Container[str]) -> None:
+    """Copy ledgers, but for some keys, and the quarantine of shards that are not committed.
+
+    Of records of one name the fullest is kept, whatever the order of the sources.
+    """
     there = {file.key for folder in ("ledger", "quarantine") for file in run.storage.list(folder)}
-    keys = [file.key for file in source.storage.list("ledger") if file.key.endswith(".json")]
-    keys += [f"quarantine/{shard:06d}.json" for shard in source.quarantined() - run.committed()]
-    new = [key for key in sorted(keys) if key not in there and key not in but]
+    held: dict[str, list[Run]] = {}
+    for source in sources:
+        keys = [file.key for file in source.storage.list("ledger") if file.key.endswith(".json")]
+        keys += [f"quarantine/{shard:06d}.json" for shard in source.quarantined() - run.committed()]
+        for key in keys:
+            if key not in there and key not in but:
+                held.setdefault(key, []).append(source)
 
     def put(pair: tuple[str, bytes | None]) -> None:
-        if pair[1] is not None:
-            run.storage.put_new(pair[0], pair[1])
+        key, data = pair
+        for source in held[key][1:]:
+            other = source.storage.get(key, MAX_RECORD_BYTES)
+            data = max(filter(None, (data, other)), key=lambda one: (len(one), one), default=None)
+        if data is not None:
+            run.storage.put_new(key, data)
 
-    for _ in run.storage.concurrent_map(put, source.storage.get_many(new, MAX_RECORD_BYTES)):
-        pass
+    for source in sources:
+        keys = sorted(key for key, runs in held.items() if runs[0] is source)
+        for _ in run.storage.concurrent_map(put, source.storage.get_many(keys, MAX_RECORD_BYTES)):
+            pass
 
 
 def _end_of_spare(source: Run, commit: Commit) -> LedgerEntry:
