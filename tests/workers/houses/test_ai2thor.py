@@ -49,9 +49,7 @@ def instance(name: str, at: tuple[float, float, float], rotation: tuple = (1, 0,
 
 
 def floor_at(height: float) -> trimesh.Trimesh:
-    mesh = floor(0, 4, 0, 3, (200, 200, 200))
-    mesh.apply_translation((0, height, 0))
-    return mesh
+    return floor(0, 4, 3, (200, 200, 200), y=height)
 
 
 def export(path: Path, meshes: list[trimesh.Trimesh]) -> None:
@@ -349,7 +347,7 @@ def test_meshes_in_millimetres_are_refused_unless_the_scene_scales_them(root: Pa
 
 
 def test_a_stage_in_millimetres_is_refused(root: Path):
-    stage = [floor(0, 8000, 0, 3000, (1, 2, 3)), box((8000, 2500, 100), (4000, 1250, -50), (230, 230, 220))]
+    stage = [floor(0, 8000, 3000, (1, 2, 3)), box((8000, 2500, 100), (4000, 1250, -50), (230, 230, 220))]
     export(root / "ai2thor/ai2thor-hab/assets/stages/iTHOR/home.glb", stage)
     with pytest.raises(InputError, match="wrong unit: the stage spans 8000 m"):
         load(root)
