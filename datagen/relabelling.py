@@ -11,6 +11,7 @@ import numpy as np
 
 from datagen.cluster.attempt import ends_job
 from datagen.cluster.attempt_guard import Meter, this_host
+from datagen.cluster.code_digest import code_digest
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.job_monitor import JobProgress
@@ -182,6 +183,7 @@ def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips:
         object=entry,
         cost=cost,
         host=this_host(),
+        code_digest=code_digest(),
         created=utc_now(),
     )
     with ends_job():

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from datagen.cluster.attempt_guard import this_host
-from datagen.configuration.specify import label_engines, scene_engines
 from datagen.console.options import AS_FOUND, Sources
 from datagen.schemas.checking.finding import Finding
 from datagen.schemas.errors import InputError
@@ -18,6 +17,7 @@ from datagen.schemas.fields import Field
 from datagen.schemas.record_files import object_key
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_scenes
+from datagen.workers.engine_versions import label_engines, scene_engines
 from datagen.workers.run_shard import run_shard
 from datagen.workers.world import World, open_world
 

@@ -51,6 +51,7 @@ def manifest_of(spec: Specification, layout: Layout) -> Manifest:
         schema_version=schema.version,
         layout=layout,
         code_version="0",
+        code_digest="0" * 64,
         libraries={},
         platform="test",
         created=utc_now(),
@@ -115,6 +116,7 @@ def commit_of(
         object=entry,
         cost=Cost(wall_s=1.0, cpu_s=1.0),
         host=Host(name="h", cpu="c", cores=1, memory_bytes=1),
+        code_digest="0" * 64,
         created=utc_now(),
     )
 

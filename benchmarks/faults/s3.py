@@ -17,6 +17,7 @@ import os
 import tempfile
 from pathlib import Path
 
+from datagen.schemas.storage import errors
 from tests.faults.s3_campaign import Outcome, campaign
 from tests.s3_servers import Faults, environment, faulty_proxy, make_bucket, moto_server
 
@@ -39,6 +40,7 @@ def one(upstream: int, shards: int, seed: int, rate: float, folder: Path) -> Out
         down_for_s=1.75 * TIMEOUT_S,
         down_at_commits=[shards // 3, 2 * shards // 3],
     )
+    errors.JOBS_WAIT_S = 0.0  # so that jobs give up, and are resumed
     with faulty_proxy(upstream, faults) as port:
         os.environ.update(environment(port) | {"DATAGEN_STORE_TIMEOUT_S": str(TIMEOUT_S)})
         return campaign(f"s3://faults-{seed}/runs/a", shards, faults, folder)

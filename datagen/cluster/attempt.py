@@ -7,14 +7,16 @@ from contextlib import contextmanager
 from functools import lru_cache
 
 from datagen.cluster.attempt_guard import Meter, this_host
-from datagen.cluster.protocol import AttemptResult, JobCannotContinue, ShardTask
+from datagen.cluster.code_digest import code_digest
+from datagen.cluster.preflight import refuse_other_code, refuse_unfit_machine
+from datagen.cluster.protocol import AttemptResult, JobCannotContinue, ShardTask, UnfitMachine
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import commit_key, utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
 from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.shard_reading import read_scenes
-from datagen.schemas.storage.errors import FORBIDDEN, FULL, machine_error
+from datagen.schemas.storage.errors import FORBIDDEN, FULL, StoreUnavailable, machine_error
 from datagen.workers.robots import gripper_of
 from datagen.workers.run_shard import run_shard
 from datagen.workers.world import World, open_world
@@ -51,6 +53,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
         object=entry,
         cost=cost,
         host=this_host(),
+        code_digest=code_digest(),
         created=utc_now(),
     )
     with ends_job():
@@ -61,31 +64,40 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
 def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:
     """Open the run, the world of its sources, and the run whose scenes are labelled again, if any.
 
-    They are opened once per process. Raises JobCannotContinue where that fails.
+    They are opened, and this machine is checked, once per process. Raises UnfitMachine where that fails.
     """
     with ends_job(every_input_error=True):
-        run, world = _open(task.run, task.spec.hash(), task.houses, task.objects)
+        refuse_other_code(task.code_digest)
+        run, world = _open(task.run, task.spec.hash(), task.houses, task.objects, task.probe)
         scenes_run = _open_scenes_run(task.scenes_from, task.spec.scenes_hash) if task.scenes_from else None
     return run, world, scenes_run
 
 
 @contextmanager
 def ends_job(every_input_error: bool = False) -> Generator[None]:
-    """Raise JobCannotContinue for a full or read-only disk and, optionally, for any InputError."""
+    """Raise JobCannotContinue for a full disk, and UnfitMachine for one that cannot be written.
+
+    Optionally also UnfitMachine for any InputError, except from a store that does not respond.
+    """
     try:
         yield
+    except StoreUnavailable:
+        raise
     except (InputError, OSError) as error:
-        known = machine_error(error, (*FULL, *FORBIDDEN))
-        if known is None and not (every_input_error and isinstance(error, InputError)):
+        if (full := machine_error(error, FULL)) is not None:
+            raise JobCannotContinue(str(full)) from error
+        forbidden = machine_error(error, FORBIDDEN)
+        if forbidden is None and not (every_input_error and isinstance(error, InputError)):
             raise
-        raise JobCannotContinue(str(known or error)) from error
+        raise UnfitMachine(str(forbidden or error)) from error
 
 
 @lru_cache(maxsize=1)  # a worker serves one run at a time, and a world is large
-def _open(path: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, World]:
+def _open(path: str, spec_hash: str, houses: str, objects: str, probe: str) -> tuple[Run, World]:
     run = Run.open(path)
     if run.manifest.spec_hash != spec_hash:
         raise InputError(path, "spec_hash", "the run now has another specification", "Submit to a new --out")
+    refuse_unfit_machine(run, probe)
     arm = run.manifest.spec.arm
     if arm is not None:
         gripper_of(arm.robot)  # broken robot files concern every shard

@@ -32,11 +32,17 @@ from typing import TypeVar
 import psutil
 
 from datagen.cluster.heartbeat import Running, Watch, beat_path, beating, running_here
-from datagen.cluster.protocol import AttemptReport, AttemptResult, JobCannotContinue, Task
+from datagen.cluster.protocol import AttemptReport, AttemptResult, JobCannotContinue, Task, UnfitMachine
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.run_records import Cost, Host, Outcome, StageClock
 from datagen.schemas.safe_files import is_private, whole_file
-from datagen.schemas.storage.errors import FULL, StoreUnavailable, machine_error
+from datagen.schemas.storage.errors import (
+    FULL,
+    StoreRefuses,
+    StoreUnavailable,
+    machine_error,
+    repeated_for_minutes,
+)
 
 T = TypeVar("T", bound=Task)
 
@@ -75,7 +81,7 @@ def guarded(function: Callable[[T, Meter], AttemptResult], task: T, deadline: bo
     meter = Meter()
     begun = AttemptReport(task.attempt, task.shard, "failed", started=utc_now(), host=this_host())
     try:
-        with _notes(task, begun.started, deadline), _progress(task, meter):
+        with _notes(task, begun.started, deadline), _progress(task, meter), repeated_for_minutes():
             try:
                 product = function(task, meter)
             except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
@@ -93,8 +99,10 @@ def guarded(function: Callable[[T, Meter], AttemptResult], task: T, deadline: bo
 
 
 def _failure(begun: AttemptReport, meter: Meter, error: Exception) -> AttemptReport:
-    # An unreachable store or a full disk concerns every shard.
-    final = error if isinstance(error, JobCannotContinue | StoreUnavailable) else machine_error(error, FULL)
+    # An unreachable store concerns every shard; a full disk for caches and notes, and missing libraries,
+    # every shard of this machine.
+    of_job = isinstance(error, JobCannotContinue | StoreUnavailable)
+    final = error if of_job or isinstance(error, ImportError) else machine_error(error, FULL)
     cause = " ".join(str(final or error).split())
     return replace(
         begun,
@@ -104,6 +112,7 @@ def _failure(begun: AttemptReport, meter: Meter, error: Exception) -> AttemptRep
         ended=utc_now(),
         cost=meter.cost(),
         ends_job=final is not None,
+        is_unfit=final is not None and (not of_job or isinstance(error, UnfitMachine | StoreRefuses)),
     )
 
 

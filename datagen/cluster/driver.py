@@ -222,7 +222,8 @@ class _Driver(Generic[T]):
         decision = decide(
             self._policy, self._troubled.get(shard, ShardFailures()), report, successes, flight.alone
         )
-        if report.outcome not in ("cancelled", "hung"):  # those have no worker's report
+        # The former have no worker's report, and an unfit machine is not used again.
+        if report.outcome not in ("cancelled", "hung") and not report.is_unfit:
             self._lost_in_a_row = self._lost_in_a_row + 1 if report.outcome == "lost" else 0
         self._recorder.close(LedgerEntry.model_validate(report, from_attributes=True))
         self._totals.count(report)
@@ -235,6 +236,8 @@ class _Driver(Generic[T]):
         elif decision.action == "retry":
             self._troubled[shard] = decision.trouble
             heapq.heappush(self._due, (self._clock() + decision.wait_s, shard))
+        elif decision.action == "move":
+            heapq.heappush(self._due, (self._clock(), shard))
         elif decision.action == "quarantine":
             self._troubled.pop(shard, None)
             self._recorder.quarantine(shard, decision.trouble)

@@ -1,53 +1,40 @@
-"""Check, before the first shard, that every machine of a cluster can make shards of the run."""
+"""What a worker checks before its first attempt: that its machine can make shards of the run."""
 
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
 
-from datagen.cluster.attempt import open_task
-from datagen.cluster.protocol import JobCannotContinue, ShardTask
+from datagen.cluster.code_digest import code_digest
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
-from datagen.workers.extras import versions_of
+from datagen.workers.engine_versions import refuse_other_engines
 
-_PATIENCE_S = 120.0  # sources are opened, and their digests computed
+_SAME_CODE = "Install the same version of datagen on every machine"
 _SHARED = "Put the run and its sources on a path that every machine has, or on s3://"
-_VERSIONS = "Install the versions of constraints.txt on every machine"
 
 
-def refuse_unfit_machines(ask: Callable[..., dict[str, Any]], run: Run, task: ShardTask) -> None:
-    """Raise InputError for the first machine that cannot make the run's shards.
-
-    `ask(function, *arguments, patience_s=...)` returns each other machine's result by its name. A machine is
-    fit when it can read and write the same run, finds the sources, and has the same versions of libraries
-    that can change bits. Machines that do not respond in time are skipped.
-    """
-    here, probe = versions_of(sorted(task.spec.engines)), f".probe-{secrets.token_hex(8)}"
+@contextmanager
+def probe_in(run: Run) -> Generator[str]:
+    """Give the name of a new file in the run, by which machines recognize it; removed after the block."""
+    probe = f".probe-{secrets.token_hex(8)}"
     run.storage.put_new(probe, b"driver")
     try:
-        found: dict[str, str] = ask(problem_here, task, probe, here, patience_s=_PATIENCE_S)
+        yield probe
     finally:
-        run.storage.delete([probe])
-    for machine, problem in sorted(found.items()):
-        if problem:
-            fix = _VERSIONS if " there, but " in problem else _SHARED
-            raise InputError(f"machine {machine}", "", problem, fix)
+        with suppress(InputError):
+            run.storage.delete([probe])
 
 
-def problem_here(task: ShardTask, probe: str, versions: Mapping[str, str]) -> str:
-    """Why this machine cannot make shards of the run; "" when it can. Runs on each machine."""
-    try:
-        run, _, _ = open_task(task)
-        if not run.storage.exists(probe):
-            return f"{task.run}: is another folder there"
-        answer = f"{probe}-{secrets.token_hex(8)}"
-        run.storage.put_new(answer, b"seen")
-        run.storage.delete([answer])
-    except (JobCannotContinue, InputError) as error:
-        return " ".join(str(error).split())
-    for name, its in versions_of(versions).items():
-        if its != versions[name]:
-            return f"{name}: is {its or 'missing'} there, but {versions[name]} on the driver's machine"
-    return ""
+def refuse_other_code(driver: str) -> None:
+    """Raise InputError where this machine's code has another digest than the driver's."""
+    if code_digest() != driver:
+        raise InputError("datagen", "", "the code here differs from that of the job's driver", _SAME_CODE)
+
+
+def refuse_unfit_machine(run: Run, probe: str) -> None:
+    """Raise InputError where `run` is another folder than the driver's, or the engines here are others."""
+    if probe and not run.storage.exists(probe):
+        raise InputError(run.storage.url, "", "is another folder here than on the driver's machine", _SHARED)
+    refuse_other_engines(f"{run.storage.url}/manifest.json", run.manifest.spec)

@@ -11,6 +11,7 @@ from threading import current_thread, main_thread
 from types import FrameType
 from typing import Literal, Protocol, TypeVar, get_args
 
+from datagen.cluster.code_digest import code_digest
 from datagen.schemas.run_records import Cost, Host, Layout, Outcome
 from datagen.schemas.specification import Specification
 
@@ -51,6 +52,8 @@ class ShardTask:
     deadline_s: float
     notes: str = ""
     scenes_from: str = ""  # folder or URL of the run whose scenes are labelled again; "" for new scenes
+    probe: str = ""  # a file of the run by which machines recognize it; "" for none
+    code_digest: str = field(default_factory=code_digest)  # of the driver's code
 
     @property
     def scene_indices(self) -> range:
@@ -85,6 +88,8 @@ class AttemptReport:
     host: Host | None = None
     # The job cannot continue: every attempt would fail (full disk, sources missing).
     ends_job: bool = False
+    # It cannot be made on its machine. Executors with other machines continue on these.
+    is_unfit: bool = False
 
 
 class Executor(Protocol[T_contra]):
@@ -104,6 +109,10 @@ class Executor(Protocol[T_contra]):
 
 class JobCannotContinue(Exception):
     """Raised by a task function for an error that no retry can fix. Its text is one line with the fix."""
+
+
+class UnfitMachine(JobCannotContinue):
+    """Raised where this machine cannot make any shard of the run; another one may."""
 
 
 @dataclass

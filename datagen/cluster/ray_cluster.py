@@ -12,7 +12,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import ExitStack, chdir, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,6 +61,9 @@ class RaySettings:
     workers: int | None = None  # slots of a local cluster; None: one per core
     attempts_per_worker: int = 200  # then a new process, because of memory leaks
     object_store_bytes: int = OBJECT_STORE_BYTES
+    task_memory_bytes: int = 0  # that an attempt requests of a running cluster
+    # Gets lines about machines of a running cluster: those that are left out, and none being free.
+    tell: Callable[[str], None] = lambda line: None
 
 
 @contextmanager

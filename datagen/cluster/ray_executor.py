@@ -23,7 +23,7 @@ from datagen.cluster.attempt_guard import (
 )
 from datagen.cluster.protocol import AttemptReport, AttemptResult, Task
 from datagen.cluster.ray_cluster import RaySettings, first_line, ray_cluster
-from datagen.cluster.ray_nodes import OtherNodes, attempts_begun, end_attempts, post_mortems_of
+from datagen.cluster.ray_nodes import OtherNodes, attempts_begun, end_attempts, perform, post_mortems_of
 from datagen.schemas.errors import InputError
 from datagen.schemas.run_records import Outcome
 
@@ -33,6 +33,8 @@ _BEGUN_SEEN_FOR_S = 1.0
 _CANCELLED_WITHIN_S = 1.0
 # Timeout for other machines, which may have to start a process first.
 _BEGUN_WITHIN_S, _POST_MORTEM_WITHIN_S, _FORGOTTEN_WITHIN_S = 10.0, 15.0, 5.0
+# A wait costs time for every attempt in flight, so it is for a share of them.
+_SHARE_AWAITED = 32
 
 T = TypeVar("T", bound=Task)
 
@@ -69,7 +71,8 @@ class RayExecutor(Generic[T]):
     """Executor over a Ray cluster that is open as long as `ray_cluster`.
 
     If the cluster dies, all attempts in flight are lost. `restart` starts another one; without it the reports
-    end the job.
+    end the job. A machine of a running cluster that cannot make shards of the run gets no further attempt; if
+    there is no other one, its report ends the job.
     """
 
     def __init__(
@@ -79,14 +82,12 @@ class RayExecutor(Generic[T]):
         ray: Any,
         restart: Callable[[], Any] | None = None,
     ) -> None:
-        self._settings, self._restart = settings, restart
-
-        def work(task: T) -> AttemptReport:
-            return guarded(function, task)
-
-        self._function: Callable[[T], AttemptReport] = work
+        self._function, self._settings, self._restart = function, settings, restart
+        self._left_out: set[str] = set()  # ids of unfit machines
         attempts = settings.attempts_per_worker
+        memory = settings.task_memory_bytes if restart is None else 0
         self._options: dict[str, Any] = {"num_cpus": 1, "max_retries": 0, "max_calls": attempts}
+        self._options["memory"] = memory
         self._tasks: dict[Any, T] = {}  # by the reference to the result
         self._refs: dict[str, Any] = {}  # by attempt
         self._killed: dict[str, float] = {}  # attempts to kill, and when to kill them by their notes
@@ -96,21 +97,28 @@ class RayExecutor(Generic[T]):
         self._join(ray)
 
     def _join(self, ray: Any) -> None:
-        self._ray, self._work = ray, ray.remote(**self._options)(self._function)
+        self._ray, self._work = ray, ray.remote(**self._options)(perform())
         self._slots, self._slots_until_s = 1, 0.0
         self.others = OtherNodes(ray, self._settings.address)
 
     @property
     def slots(self) -> int:
         if time.monotonic() >= self._slots_until_s and not self.others.own.silent():
-            self._slots = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+            slots, memory = self._fit_slots(), f"{self._options['memory'] / 2**30:g} GiB of memory"
+            if not slots and self._slots:
+                self._settings.tell(f"waiting for a machine of the cluster with a CPU and {memory}")
+            self._slots = slots
             # Other clusters grow and shrink.
             seen_for_s = _SLOTS_SEEN_FOR_S if self._restart is None else float("inf")
             self._slots_until_s = time.monotonic() + seen_for_s
-        return self._slots
+        return max(1, self._slots)
 
     def submit(self, task: T) -> None:
-        ref = self._work.options(name=f"shard {task.shard}").remote(task)
+        options: dict[str, Any] = {"name": f"shard {task.shard}"}
+        if self._left_out:
+            options["label_selector"] = {"ray.io/node-id": f"!in({','.join(sorted(self._left_out))})"}
+        packed = self._ray.cloudpickle.dumps((guarded, self._function, task))
+        ref = self._work.options(**options).remote(packed)
         self._tasks[ref], self._refs[task.attempt] = task, ref
         self._jobs.add(task.notes)
 
@@ -122,7 +130,7 @@ class RayExecutor(Generic[T]):
             return self._lose_all(dead)
         self._end_stubborn()
         refs = list(self._tasks)
-        ready, _ = self._ray.wait(refs, num_returns=1, timeout=timeout_s)
+        ready, _ = self._ray.wait(refs, num_returns=max(1, len(refs) // _SHARE_AWAITED), timeout=timeout_s)
         if ready:  # also take all others that have ended
             ready, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)
         ended = [self._result(ref) for ref in ready]
@@ -200,8 +208,8 @@ class RayExecutor(Generic[T]):
         del self._refs[task.attempt]
         killed = self._killed.pop(task.attempt, None) is not None
         try:
-            return self._ray.get(ref)
-        except e.RayTaskError as error:  # outside the guard: the task or its module could not be loaded
+            node, address, report = self._ray.get(ref)
+        except e.RayTaskError as error:  # outside the guard
             return _Death(task, "failed", f"{type(error.cause).__name__}: {error.cause}")
         except e.TaskCancelledError:
             return _Death(task, "cancelled", "killed")
@@ -213,6 +221,27 @@ class RayExecutor(Generic[T]):
             return _Death(task, "crashed", "the worker process died (killed, or crashed in native code)")
         except e.RayError as error:  # node, raylet, owner or object lost: not the shard's fault
             return _Death(task, "lost", f"{type(error).__name__}: {first_line(error)}")
+        if isinstance(report, str):  # the package, or the function, could not be loaded there
+            report = replace(failure_report(task, "failed", report), is_unfit=True, ends_job=True)
+        if not report.is_unfit or self._restart is not None:
+            return report
+        cause = f"{address} (node {node[:12]}): {report.cause}"
+        if node not in self._left_out:
+            self._left_out.add(node)
+            self._slots_until_s = 0.0
+            self._settings.tell(f"left out: machine {cause}")
+        if self._fit_slots():
+            return replace(report, outcome="lost", ends_job=False, cause=f"unfit machine {cause}")
+        return replace(report, cause=f"no machine of the cluster is fit. {cause}")
+
+    def _fit_slots(self) -> int:
+        """Attempts that can run at the same time on machines that are not left out."""
+        bytes_each, slots = max(1, self._options["memory"]), 0
+        for node in self._ray.nodes():
+            if node["Alive"] and node["NodeID"] not in self._left_out:
+                has = node["Resources"]
+                slots += int(min(has.get("CPU", 0), has.get("memory", 0) // bytes_each))
+        return slots
 
     def _failure_reports(self, deaths: list[_Death[T]]) -> list[AttemptReport]:
         """Reports of dead attempts from their files here; other machines are asked for the rest."""

@@ -120,6 +120,28 @@ class OtherNodes:
         return sent
 
 
+def perform() -> Callable[[bytes], tuple[str, str, Any]]:
+    """The function of an attempt's task: runs `guard(function, task)` of the pickled three.
+
+    It returns the id and address of its machine with the report, or with the error of loading them as text:
+    it is sent by value and needs nothing of this package, which a machine may lack.
+    """
+
+    def attempt(packed: bytes) -> tuple[str, str, Any]:
+        import pickle
+
+        import ray
+
+        here = ray.get_runtime_context().get_node_id(), ray.util.get_node_ip_address()
+        try:
+            guard, function, task = pickle.loads(packed)  # noqa: S301 - from the driver, as all tasks of Ray
+        except Exception as error:  # noqa: BLE001 - reported, whatever it is
+            return *here, f"{type(error).__name__}: {error}"
+        return *here, guard(function, task)
+
+    return attempt
+
+
 # Functions of the requests, which run on the other machines.
 
 

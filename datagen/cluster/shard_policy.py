@@ -15,7 +15,7 @@ from typing import Literal
 from datagen.cluster.protocol import AttemptReport
 from datagen.schemas.shard_ranges import ShardRanges
 
-Action = Literal["done", "retry", "quarantine", "drop", "abort"]
+Action = Literal["done", "retry", "move", "quarantine", "drop", "abort"]
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def decide(
     A superseded attempt is done: another one is committed. A cancelled one is dropped: the job is stopping,
     and the shard stays open for the next. A loss counts against the shard where it was `alone` in flight, or
     where others succeeded since its last loss (`successes` counts the job's): a lost machine or cluster loses
-    all attempts, whatever the shard.
+    all attempts, whatever the shard. The failure of an unfit machine counts against no shard.
     """
     if report.outcome in ("committed", "superseded"):
         return Decision("done", trouble)
@@ -87,6 +87,8 @@ def decide(
         return Decision("drop", trouble)
     if report.ends_job:
         return Decision("abort", trouble)
+    if report.is_unfit:
+        return Decision("move", trouble)
     lost = report.outcome == "lost"
     now = replace(
         trouble,

@@ -125,6 +125,7 @@ def _report(
         "bytes": checked.bytes,
         "samples": checked.samples,
         "sealed": checked.is_sealed,
+        "shards_of_other_code": checked.of_other_code,
         "seal_is_stale": found.counts["stale"] > 0,
         "ledger": {
             "attempts": totals.attempts,
@@ -162,6 +163,9 @@ def _print(report: dict[str, Any], checked: Checked, found: _Found, repaired: Re
         ),
         ("sealed", "yes" if checked.is_sealed else "no"),
     ]
+    if checked.of_other_code:
+        made = f"{counted(checked.of_other_code, 'shard')} made by other code than began the run"
+        rows.append(("note", f"{made}, of the same label and engine versions"))
     if repaired is not None:
         rows.append(("restored", counted(len(repaired.restored), "record")))
         rows.append(("set aside", listed(sorted(repaired.set_aside)) or "nothing"))

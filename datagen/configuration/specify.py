@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from datagen import __version__
+from datagen.cluster.code_digest import code_digest
 from datagen.configuration.toml_files import first_of, read_toml
 from datagen.schemas.errors import InputError, choices
 from datagen.schemas.fields import SCHEMAS
@@ -24,6 +25,7 @@ from datagen.schemas.specification import (
     Source,
     Specification,
 )
+from datagen.workers.engine_versions import ARM_PACKAGES, arm_versions, label_engines, scene_engines
 from datagen.workers.extras import how_to_get, versions_of
 from datagen.workers.houses.house import HouseSource
 from datagen.workers.labels import load_label_source
@@ -31,19 +33,11 @@ from datagen.workers.objects.model import ObjectSource
 from datagen.workers.registry import allow, entry
 from datagen.workers.rendering import RENDERERS, load_renderer
 from datagen.workers.robots import ROBOTS, robot_limits
-from datagen.workers.scenes import scenes_version
 from datagen.workers.settling import SETTLERS, first_settler, load_settler
 
 Fields = dict[str, Any]
 Options = Mapping[str, Any]  # by dotted name in the specification; None where not given
 
-# Distributions whose version can change bits of a sample, by the engine that needs them.
-_ENGINE_PACKAGES = {"sapien": "sapien", "pybullet": "pybullet", "embree": "embreex"}
-# Label sources that move an arm, and the distributions whose version can change bits of their labels.
-ARM_PACKAGES: dict[str, tuple[str, ...]] = {
-    "plan": ("coal", "mani_skill", "pin", "sapien"),
-    "sim": ("coal", "mani_skill", "pin", "sapien"),
-}
 # Sections of the arm that only some label sources have.
 _NOT_FOR: dict[str, tuple[str, ...]] = {"plan": ("trial",), "sim": ()}
 # Reaches are stated in whole millimetres.
@@ -163,35 +157,13 @@ def manifest_of(spec: Specification, layout: Layout, sources: dict[str, str]) ->
         schema_version=SCHEMAS[source.schema].version,
         layout=layout,
         code_version=__version__,
+        code_digest=code_digest(),
         libraries={name: found for name, found in versions_of(_LIBRARIES).items() if found}
         | arm_versions(spec.label_source),
         platform=platform.platform(),
         created=utc_now(),
         sources=sources,
     )
-
-
-def scene_engine_names(spec: Specification) -> set[str]:
-    """Names in `engines` of what can change bits of the scenes and candidates of this specification."""
-    used = (spec.settle.engine, spec.observation.renderer)
-    return {"scenes", *(_ENGINE_PACKAGES[name] for name in used)}
-
-
-def label_engines(label_source: str) -> dict[str, str]:
-    """Versions of what can change bits of labels, and of the random streams of scenes and labels."""
-    return {
-        _ENGINE_PACKAGES["embree"]: version(_ENGINE_PACKAGES["embree"]),
-        # numpy may change what a generator draws between feature releases, never between patches.
-        "numpy": ".".join(version("numpy").split(".")[:2]),
-        "labels": str(load_label_source(label_source).version),
-        **arm_versions(label_source),
-    }
-
-
-def scene_engines(spec: Specification) -> dict[str, str]:
-    """Versions on this machine of what can change bits of the scenes and candidates."""
-    packages = sorted(scene_engine_names(spec) - {"scenes"})
-    return {name: version(name) for name in packages} | {"scenes": str(scenes_version(spec))}
 
 
 def put_field(fields: dict[str, Any], name: str, value: Any, config: Path | None) -> None:
@@ -217,11 +189,6 @@ def refuse_missing_packages(label_source: str) -> None:
             raise InputError(
                 "label source", label_source, f"needs {name}, not installed", how_to_get("sim")
             ) from None
-
-
-def arm_versions(label_source: str) -> dict[str, str]:
-    """Versions of the distributions that plan or simulate the arm of this label source."""
-    return {name: version(name) for name in ARM_PACKAGES.get(label_source, ())}
 
 
 def complete_arm(

@@ -8,15 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from datagen.configuration.specify import (
-    ARM_PACKAGES,
     complete_arm,
-    label_engines,
     layout_of,
     put_field,
     read_fields,
     refuse_unsuited,
     robot_of,
-    scene_engine_names,
     validated,
 )
 from datagen.schemas.errors import InputError
@@ -24,6 +21,7 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
 from datagen.schemas.shard_reading import committed_scenes
 from datagen.schemas.specification import Specification
+from datagen.workers.engine_versions import ARM_PACKAGES, label_engines, scene_engine_names
 
 # Sections that a configuration may set for stored scenes.
 _LABEL_SECTIONS = ("arm", "heuristic", "visibility")

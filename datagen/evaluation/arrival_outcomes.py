@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from datagen.cluster.environment import changed_environment
-from datagen.configuration.specify import label_engines
 from datagen.display.progress import counting
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import Stream, digest_of, generator
@@ -30,6 +29,7 @@ from datagen.schemas.run_records import StageClock
 from datagen.schemas.safe_files import read_regular, whole_file
 from datagen.schemas.shard_reading import read_scene
 from datagen.schemas.specification import Specification
+from datagen.workers.engine_versions import label_engines
 from datagen.workers.labels.arm_labelling import arm_in_scene, draw_disturbances
 from datagen.workers.labels.arrival_trial import arrival_specification, try_arrival
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene

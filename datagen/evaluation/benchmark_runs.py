@@ -13,11 +13,12 @@ from datagen.console.options import Sources
 from datagen.evaluation.benchmark import BenchmarkRun
 from datagen.jobs.job import Job, JobOptions
 from datagen.jobs.job_report import JobResult
-from datagen.jobs.start_job import open_job_run, refuse_other_engines
+from datagen.jobs.start_job import open_job_run
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Manifest
 from datagen.schemas.storage import open_storage
+from datagen.workers.engine_versions import refuse_other_engines
 from datagen.workers.survey import stored_notes, survey_sources
 from datagen.workers.world import open_world
 

@@ -19,7 +19,7 @@ from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.job_monitor import JobMonitor, JobRecorder
-from datagen.cluster.preflight import refuse_unfit_machines
+from datagen.cluster.preflight import probe_in
 from datagen.cluster.protocol import (
     Executor,
     JobSummary,
@@ -30,7 +30,7 @@ from datagen.cluster.protocol import (
     stop_on_signals,
 )
 from datagen.cluster.ray_cluster import RaySettings, refuse_unusable
-from datagen.cluster.ray_executor import RayExecutor, ray_executor
+from datagen.cluster.ray_executor import ray_executor
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.shard_policy import RetryPolicy, too_many_quarantined
 from datagen.console.command_lines import Interrupted, command_line, resumable
@@ -43,8 +43,10 @@ from datagen.schemas.jobs import JobEnd, Jobs
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage
+from datagen.schemas.storage.errors import JOBS_WAIT_S, repeated_for_minutes
 from datagen.workers.extras import refuse_missing
 
+_TASK_MEMORY_BYTES = 2**30  # that an attempt requests of a running cluster, twice with an arm
 _DETACH = (
     "Run as a Ray job that continues after this shell ends: on the cluster of --address, its dashboard "
     "http://HOST:8265, else on a Ray head of this machine."
@@ -196,16 +198,19 @@ class Job:
                 deadline_s=order.deadline_s,
                 notes=notes,
                 scenes_from=job_run.scenes_from,
+                probe=probe,
             )
 
-        if isinstance(executor, RayExecutor):
-            shown.phase("checking the machines")
-            probe = make_task(AttemptOrder(shards[0], "probe", deadline_s=0.0))
-            refuse_unfit_machines(executor.others.ask, run, probe)
         shown.phase("making labels")
         done = len(run.planned()) - len(shards)
         events = JobMonitor(recorder, stop, shown, layout.samples_per_shard, done, notes)
-        return drive(shards, make_task, executor, RunRecorder(run), self.policy, events, stop)
+        policy = self.policy
+        if run.storage.folder is None:  # attempts that wait for the store are not hung
+            policy = replace(policy, min_deadline_s=policy.min_deadline_s + JOBS_WAIT_S)
+        waiting = "waiting for the object store: "
+        tell_trouble = repeated_for_minutes(lambda error: _tell(shown, "store", waiting + error.problem))
+        with probe_in(run) as probe, tell_trouble:
+            return drive(shards, make_task, executor, RunRecorder(run), policy, events, stop)
 
     def _executor(self, shards: int, stack: ExitStack, shown: Progress) -> Executor[ShardTask]:
         if self.options.workers == 0:
@@ -213,7 +218,13 @@ class Job:
         shown.phase("starting Ray")
         cores = len(os.sched_getaffinity(0))
         workers = min(self.options.workers or cores, shards)  # Ray starts them all at once
-        settings = RaySettings(address=self.options.address, workers=workers)
+        has_arm = any(each.run.manifest.spec.arm for each in self.runs)
+        settings = RaySettings(
+            address=self.options.address,
+            workers=workers,
+            task_memory_bytes=_TASK_MEMORY_BYTES << has_arm,
+            tell=lambda line: _tell(shown, "machines", line),
+        )
         return stack.enter_context(ray_executor(run_attempt, settings))
 
     def _count_missing(self) -> int:
@@ -263,6 +274,10 @@ class Job:
         shards = sum(len(run.committed()) for run in runs)
         with self.options.display() as shown:
             return seal(self.storage, shown.counter("shards sealed")) if shards else ""
+
+
+def _tell(shown: Progress, event: str, line: str) -> None:
+    shown.say(event, {"text": line}, line, "yellow")
 
 
 class _CannotContinue(InputError):

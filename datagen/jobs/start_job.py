@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError
 from typing import Any, TypeVar
 
 from datagen.cluster.job_monitor import JOBS_API
 from datagen.cluster.ray_head import head_token
-from datagen.configuration.specify import label_engines, refuse_missing_packages, scene_engines
+from datagen.configuration.specify import refuse_missing_packages
 from datagen.console.command_lines import absolute_path, absolute_source, given_options, words_of
 from datagen.console.options import AS_FOUND, Sources
 from datagen.doctor.engines import probe_render_device
 from datagen.jobs.job import JobOptions, JobRun
 from datagen.replaying import open_sources
 from datagen.schemas.errors import InputError
-from datagen.schemas.record_files import different_fields
 from datagen.schemas.run import Run
 from datagen.schemas.specification import Specification
-from datagen.workers.extras import missing_library
+from datagen.workers.engine_versions import refuse_other_engines
 from datagen.workers.labels import load_label_source
 from datagen.workers.robots import gripper_of
 
@@ -83,20 +81,3 @@ def refuse_unusable_engines(spec: Specification, address: str) -> None:
         if not device.succeeded:
             problem, fix = f"finds no render device ({device.text})", "Use embree, or see `datagen doctor`"
             raise InputError("observation.renderer", "sapien", problem, fix)
-
-
-def refuse_other_engines(place: str, spec: Specification) -> None:
-    """Raise InputError for a specification of other versions of the label code or of engines than here."""
-    try:
-        here = label_engines(spec.label_source)
-        if spec.scenes_from is None:  # stored scenes need no scene engines
-            here |= scene_engines(spec)
-    except PackageNotFoundError as error:
-        missing = missing_library(error)
-        fix = missing.fix if missing else "Install it"
-        raise InputError(place, "engines", f"{error.name} is not installed", fix) from None
-    made = {name: version for name, version in spec.engines.items() if name in here}
-    rows = [f"{name}: the run has {a}, this machine {b}" for name, a, b in different_fields(made, here)]
-    if rows:
-        fix = "Install the run's versions, or start a new run"
-        raise InputError(place, "engines", "; ".join(rows), fix)

@@ -27,6 +27,7 @@ JobEnd = Literal["", "complete", "interrupted", "failed", "aborted", "broken"]
 Stop = Literal["now", "drain"]
 Health = Literal["ended", "live", "silent", "dead"]
 SILENT_AFTER = timedelta(minutes=1)
+_AHEAD = timedelta(minutes=5)  # clocks of machines differ by less
 # A process that began after the job's record was written only reuses its number.
 _PID_SLACK_S = 5.0
 _JOB_FILE = re.compile(r"jobs/([0-9]{8}T[0-9]{6}-[0-9a-f]{8})\.json")
@@ -80,8 +81,10 @@ class StoredJob:
         return self.record.id
 
     def silence(self, at: datetime | None = None) -> timedelta:
+        """Time since the last sign. One that is far ahead of the clock is no sign of life, but as old."""
         last = self.state.updated if self.state else self.record.started
-        return max((at or datetime.now(UTC)) - _time_of(last), timedelta())
+        silence = (at or datetime.now(UTC)) - _time_of(last)
+        return max(silence, timedelta()) if silence > -_AHEAD else -silence
 
     def health(self, at: datetime | None = None) -> Health:
         """ended, live, dead, or silent: on another machine, without a record for a minute."""

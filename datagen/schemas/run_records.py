@@ -74,6 +74,7 @@ class Manifest(StoredRecord):
     schema_version: int
     layout: Layout
     code_version: str
+    code_digest: Digest  # of the package's Python files, on the machine that began the run
     libraries: dict[str, str]
     platform: str
     created: str
@@ -200,6 +201,7 @@ class Commit(StoredRecord):
     object: FileEntry  # the rows, in shards/
     cost: Cost
     host: Host
+    code_digest: Digest  # of the package's Python files that made the shard
     created: str
 
 

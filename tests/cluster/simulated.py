@@ -50,7 +50,7 @@ def commit_by(shard: int, attempt: str, samples: int = 10) -> Commit:
     return Commit(
         shard=shard, attempt=attempt, spec_hash="0" * 64, scenes=1, samples=samples, positives=3,
         redraws={}, object=FileEntry.of("a.zip", b""),
-        cost=Cost(wall_s=6.0, cpu_s=3.0), host=host, created="",
+        cost=Cost(wall_s=6.0, cpu_s=3.0), host=host, code_digest="0" * 64, created="",
     )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from datagen.schemas.record_files import object_key
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
 from datagen.schemas.specification import CandidateParams, Source, Specification
+from datagen.workers.engine_versions import label_engines, scene_engines
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
 from tests.made_runs import make_run, small_spec
@@ -41,7 +42,8 @@ def spec() -> Specification:
     opened = {"houses": open_houses("builtin"), "objects": open_objects("builtin")}
     sources = {name: Source(kind=source.kind, digest=source.digest) for name, source in opened.items()}
     few = CandidateParams(per_scene=5)
-    return small_spec(n_points=256, candidates=few).model_copy(update=sources)
+    plain = small_spec(n_points=256, candidates=few).model_copy(update=sources)
+    return plain.model_copy(update={"engines": label_engines("heuristic") | scene_engines(plain)})
 
 
 def attempt_at(run: Run, name: str = "a", notes: str = "") -> AttemptReport:

@@ -1,51 +1,41 @@
-"""A machine that cannot make a run's shards is named before the first one."""
+"""A worker refuses the first attempt where its machine cannot make shards of the run, and says why."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from datagen.cluster.preflight import problem_here, refuse_unfit_machines
-from datagen.cluster.protocol import ShardTask
-from datagen.schemas.errors import InputError
+from datagen.cluster.attempt import open_task
+from datagen.cluster.attempt_guard import Meter, guarded
+from datagen.cluster.preflight import probe_in
+from datagen.cluster.protocol import AttemptResult, ShardTask, UnfitMachine
 from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage
+from datagen.schemas.storage.errors import StoreRefuses, StoreUnavailable
+from tests.faults.scripted import ScriptedTask
+from tests.made_runs import make_run, small_spec
 from tests.small_runs import files_of, make_small_run
-
-Ask = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    folder = tmp_path_factory.mktemp("fitness") / "run"
-    make_small_run(folder, 8)
-    return Run.open(folder)
+    return Run.open(make_small_run(tmp_path_factory.mktemp("fitness") / "run", 8))
 
 
-def task_of(made: Run, run: str = "", houses: str = "builtin", objects: str = "builtin") -> ShardTask:
-    place, spec = run or made.storage.url, made.manifest.spec
-    return ShardTask(place, spec, made.layout, 0, "probe", houses, objects, deadline_s=0.0)
-
-
-def one_machine(seen: ShardTask | None = None) -> Ask:
-    """A cluster of one other machine, which is this one, or sees other places."""
-
-    def ask(function: Any, task: ShardTask, *arguments: Any, patience_s: float) -> dict[str, Any]:
-        assert function is problem_here and patience_s > 0
-        return {"192.0.2.7 (node abc)": problem_here(seen or task, *arguments)}
-
-    return ask
+def task_of(made: Run, **changes: Any) -> ShardTask:
+    task = ShardTask(made.storage.url, made.manifest.spec, made.layout, 0, "a", "builtin", "builtin", 60.0)
+    return replace(task, **changes)
 
 
 def test_a_machine_that_sees_run_and_sources_is_fit_and_leaves_nothing_behind(run: Run) -> None:
     before = files_of(Path(run.storage.url))
-    refuse_unfit_machines(one_machine(), run, task_of(run))
+    with probe_in(run) as probe:
+        assert open_task(task_of(run, probe=probe))[0].manifest == run.manifest
     assert files_of(Path(run.storage.url)) == before
-    refuse_unfit_machines(lambda *arguments, patience_s: {}, run, task_of(run))  # nobody answers in time
 
 
 @pytest.mark.parametrize(
@@ -54,27 +44,48 @@ def test_a_machine_that_sees_run_and_sources_is_fit_and_leaves_nothing_behind(ru
         ({"run": "/no/such/run"}, "no such folder"),
         ({"houses": "procthor:/no/such/houses"}, "/no/such/houses"),
         ({"objects": "ycb:/no/such/objects"}, "/no/such/objects"),
+        ({"code_digest": "0" * 64}, "the code here differs from that of the job's driver"),
+        ({"probe": ".probe-of-another"}, "is another folder here than on the driver's machine"),
     ],
 )
-def test_a_machine_that_lacks_something_is_named(run: Run, changes: dict[str, str], problem: str) -> None:
-    words = rf"^machine 192\.0\.2\.7 \(node abc\): .*{problem}.* or on s3://$"
-    with pytest.raises(InputError, match=words):
-        refuse_unfit_machines(one_machine(task_of(run, **changes)), run, task_of(run))
+def test_a_machine_that_lacks_something_is_unfit(run: Run, changes: dict[str, str], problem: str) -> None:
+    with pytest.raises(UnfitMachine, match=problem):
+        open_task(task_of(run, **changes))
 
 
 def test_another_folder_of_the_same_name_is_not_the_run(run: Run, tmp_path: Path) -> None:
     shutil.copytree(run.storage.url, tmp_path, dirs_exist_ok=True)
-    assert Run.open(tmp_path).manifest == run.manifest
-    copy = task_of(run, run=open_storage(tmp_path).url)
-    with pytest.raises(InputError, match="is another folder there"):
-        refuse_unfit_machines(one_machine(copy), run, task_of(run))
+    with probe_in(run) as probe, pytest.raises(UnfitMachine, match="is another folder here"):
+        open_task(task_of(run, run=open_storage(tmp_path).url, probe=probe))
 
 
-def test_a_machine_with_other_versions_is_named(run: Run) -> None:
-    problem = problem_here(task_of(run), ".probe", {"numpy": "1.0"})
-    assert "is another folder" in problem  # a probe that is not there
-    run.storage.put_new(".probe", b"")
-    problem = problem_here(task_of(run), ".probe", {"numpy": "1.0", "scenes": ""})
-    run.storage.delete([".probe"])
-    with pytest.raises(InputError, match=r"numpy: is .* there, but 1\.0 on the .* Install"):
-        refuse_unfit_machines(lambda *arguments, patience_s: {"another": problem}, run, task_of(run))
+@pytest.mark.parametrize(("name", "text"), [("labels", "9"), ("scenes", "0"), ("numpy", "1.0")])
+def test_a_machine_with_other_engines_is_unfit(run: Run, tmp_path: Path, name: str, text: str) -> None:
+    spec = run.manifest.spec
+    spec = spec.model_copy(update={"engines": {**spec.engines, name: text}})
+    other = make_run(tmp_path / "run", spec=spec, shards=())
+    with pytest.raises(UnfitMachine, match=f"{name}: the run has {text}, this machine "):
+        open_task(task_of(other))
+
+
+@pytest.mark.parametrize(
+    ("error", "is_unfit"),
+    [
+        (ImportError("libGL.so.1: cannot open shared object file"), True),
+        (ModuleNotFoundError("No module named 'trimesh'"), True),
+        (OSError(28, "No space left on device"), True),  # of a cache: the run's own disk ends the job
+        (StoreRefuses("s3://bucket/run", "", "access denied", "Check the keys"), True),
+        (StoreUnavailable("s3://bucket/run", "", "the store responds 503", "Wait"), False),
+    ],
+)
+def test_errors_of_a_machine_count_against_no_shard(error: Exception, is_unfit: bool, tmp_path: Path) -> None:
+    def fail(task: ScriptedTask, meter: Meter) -> AttemptResult:
+        raise error
+
+    report = guarded(fail, ScriptedTask(0, "a", 60.0, str(tmp_path)), deadline=False)
+    assert (report.outcome, report.ends_job, report.is_unfit) == ("failed", True, is_unfit)
+
+
+def test_a_specification_without_engines_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UnfitMachine, match="engines: "):
+        open_task(task_of(make_run(tmp_path / "run", spec=small_spec(), shards=())))

@@ -11,17 +11,13 @@ import pytest
 
 from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.preflight import refuse_unfit_machines
-from datagen.cluster.protocol import ShardTask, StopRequest
+from datagen.cluster.protocol import StopRequest
 from datagen.cluster.ray_cluster import RaySettings, forget_former_token, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
 from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, head_environment, new_token
 from datagen.cluster.shard_policy import RetryPolicy
-from datagen.schemas.errors import InputError
-from datagen.schemas.run import Run
 from tests.cluster.simulated import Heard, PaperRecorder
 from tests.faults.scripted import ScriptedTask, perform
-from tests.small_runs import make_small_run
 
 pytestmark = pytest.mark.slow
 
@@ -102,19 +98,3 @@ def test_deaths_on_another_machine_leave_their_stacks_in_the_ledger(
     assert "ended by the driver" in first[2].cause
     assert all(e.host is not None and e.host.pid > 0 and e.cost is not None for e in first.values())
     assert left == [] and list(machines.folder.rglob("datagen-notes-*")) == []
-
-
-def test_a_machine_that_does_not_see_the_run_is_named(
-    machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = Run.open(make_small_run(tmp_path / "run", 8))
-    # One name, which each machine takes for a folder of its own: the first has the run there.
-    (machines.folder / "first" / "home" / "run").symlink_to(tmp_path / "run")
-    task = ShardTask("~/run", run.manifest.spec, run.layout, 0, "probe", "builtin", "builtin", 0.0)
-    executor = RayExecutor(perform, machines.settings, machines.ray)
-    with pytest.raises(InputError) as told:
-        refuse_unfit_machines(executor.others.ask, run, task)
-    second = executor.others.alive()[machines.second.node_id]
-    assert str(told.value).startswith(f"machine {second}: ") and "no such folder" in str(told.value)
-    (machines.folder / "second" / "home" / "run").symlink_to(tmp_path / "run")
-    refuse_unfit_machines(executor.others.ask, run, task)

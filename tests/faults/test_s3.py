@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from datagen.schemas.storage import errors
 from tests.faults.s3_campaign import campaign
 from tests.s3_servers import Faults, environment, faulty_proxy
 
@@ -27,6 +28,7 @@ def test_a_job_on_a_failing_store_is_resumed_until_it_is_done(
         down_at_commits=[0],
         down_for_s=3.5,
     )
+    monkeypatch.setattr(errors, "JOBS_WAIT_S", 0.0)  # so that jobs give up, and are resumed
     with faulty_proxy(s3_port, faults) as port:
         for name, value in environment(port).items():
             monkeypatch.setenv(name, value)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import time
 from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
@@ -93,6 +94,15 @@ def test_nothing_is_removed_while_a_job_may_be_alive(
             clean_runs(run.storage, kept_s=-60)
         assert files_of(tmp_path).items() >= before.items()
         jobs.put_state(JobState(id=record.id, updated=utc_now(), phase="ended", end="complete"))
+    assert clean_runs(run.storage, kept_s=-60).files == len(garbage)
+
+
+def test_a_job_killed_with_its_clock_ahead_does_not_keep_garbage_for_years(tmp_path: Path) -> None:
+    run, garbage = littered(tmp_path)
+    ahead = (datetime.now(UTC) + timedelta(days=1100)).isoformat()
+    for host, pid in (("elsewhere", 1), (platform.node(), 2**22 + 1)):
+        job = JobRecord(id=new_job_id(), command=(), host=host, pid=pid, started=ahead, address="local")
+        Jobs(run.storage).begin(job)
     assert clean_runs(run.storage, kept_s=-60).files == len(garbage)
 
 

@@ -39,6 +39,10 @@ def test_a_job_is_dead_when_it_is_silent_and_its_process_is_gone(tmp_path: Path)
         (NOBODY, "", 2, "dead"),
         (1, "elsewhere", 0.5, "live"),
         (1, "elsewhere", 2, "silent"),
+        # Times ahead: of another machine's clock, and of one that was years ahead when its job was killed.
+        (1, "elsewhere", -2, "live"),
+        (1, "elsewhere", -1e6, "silent"),
+        (NOBODY, "", -1e6, "dead"),
     ):
         record = record_of(at, pid, host)
         jobs.begin(record)

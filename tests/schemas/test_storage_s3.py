@@ -13,8 +13,12 @@ import pytest
 from obstore.exceptions import GenericError
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.storage import Storage, open_storage
-from datagen.schemas.storage.errors import StoreUnavailable, store_trouble
+from datagen.schemas.storage import Storage, open_storage, remote_objects
+from datagen.schemas.storage.errors import (
+    StoreUnavailable,
+    repeated_for_minutes,
+    store_trouble,
+)
 from tests.s3_servers import Faults, environment, faulty_proxy
 
 Behind = Callable[[Faults], AbstractContextManager[Storage]]
@@ -119,6 +123,26 @@ def test_a_store_that_is_down_is_told_within_the_bound(behind: Behind, monkeypat
             assert "\n" not in str(e.value) and "made up" not in str(e.value)
 
 
+def test_a_job_waits_longer_for_the_store_than_another_command(
+    behind: Behind, monkeypatch: pytest.MonkeyPatch
+):
+    faults, told = Faults(), list[StoreUnavailable]()
+    monkeypatch.setattr(remote_objects, "PATIENCE", 0.0)
+    with behind(faults) as s:
+        s.put("a", b"1")
+        faults.script = ["error"] * 4
+        with pytest.raises(StoreUnavailable):
+            s.get("a", 9)  # two tries
+        assert faults.script == ["error"] * 2
+        faults.script = ["error"] * 6
+        with repeated_for_minutes(told.append):
+            assert s.get("a", 9) == b"1"
+        assert len(told) == 1 and "the store responds 50" in str(told[0])
+        faults.script = ["error"] * 2
+        with pytest.raises(StoreUnavailable):
+            s.get("a", 9)
+
+
 @contextmanager
 def answering(answer: bytes | None) -> Generator[int]:
     """A port where every connection gets this answer; none for None, and no connection for b""."""
@@ -154,11 +178,20 @@ def answer(status: str, code: str) -> bytes:
 @pytest.mark.parametrize(
     ("reply", "problem"),
     [
-        (answer("403 Forbidden", "AccessDenied"), "access denied (AccessDenied). Check AWS_ACCESS_KEY_ID"),
-        (answer("403 Forbidden", "SignatureDoesNotMatch"), "access denied (SignatureDoesNotMatch)"),
-        (answer("400 Bad Request", "ExpiredToken"), "access denied (ExpiredToken)"),
+        (answer("403 Forbidden", "AccessDenied"), "access denied (AccessDenied). Allow AWS_ACCESS_KEY_ID"),
+        (answer("403 Forbidden", "InvalidAccessKeyId"), "access denied (InvalidAccessKeyId). Check AWS_ACC"),
+        (answer("403 Forbidden", "SignatureDoesNotMatch"), "(SignatureDoesNotMatch). Check AWS_SECRET_ACC"),
+        (answer("400 Bad Request", "ExpiredToken"), "credentials have expired (ExpiredToken). Set new AWS_"),
+        (answer("403 Forbidden", "RequestTimeTooSkewed"), "(RequestTimeTooSkewed). Set the clock"),
         (answer("404 Not Found", "NoSuchBucket"), "no such bucket. Create the bucket"),
         (answer("301 Moved", "PermanentRedirect"), "the bucket is in another region. Set AWS_REGION"),
+        (answer("400 Bad Request", "AuthorizationHeaderMalformed"), "is in another region (Authorization"),
+        (answer("400 Bad Request", "XMinioAdminBucketQuotaExceeded"), "the store is full (XMinioAdminBuck"),
+        (
+            answer("507 Insufficient Storage", "XMinioStorageFull"),
+            "the store is full (XMinioStorageFull). Free",
+        ),
+        (answer("403 Forbidden", "Unheard"), "access denied (Unheard). Check AWS_ACCESS_KEY_ID"),
         (answer("501 Not Implemented", "NotImplemented"), "the store refuses (501 NotImplemented)"),
         (answer("503 Slow Down", "SlowDown"), "the store responds 503 SlowDown. Wait until"),
         (b"SSH-2.0-OpenSSH\r\n\r\n", "is not that of an S3 store. Check that AWS_ENDPOINT_URL"),

@@ -38,6 +38,7 @@ class Checked:
     is_sealed: bool = False
     totals: LedgerTotals = field(default_factory=LedgerTotals)
     runs: list[Run] = field(default_factory=list[Run])
+    of_other_code: int = 0  # shards by other code than began their run
 
     def count(self, commit: Commit) -> None:
         self.shards += 1
@@ -78,6 +79,7 @@ def check_runs(
                 if looked.commit is not None:
                     committed[looked.shard] = looked.commit.attempt
                     checked.count(looked.commit)
+                    checked.of_other_code += looked.commit.code_digest != run.manifest.code_digest
                 done += 1
                 seen(done, total)
             rest = (_check_objects(run), check_ledger(run, committed, checked.totals), check_quarantine(run))

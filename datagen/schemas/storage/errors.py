@@ -5,7 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,6 +36,50 @@ _OTHER_FIX = "Check that the path exists, is reachable and can be written"
 
 _RESUME = "then continue with `datagen resume`"
 _KEYS_FIX = "Check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, and what they allow in this bucket"
+_REGION_FIX = "Set AWS_REGION to the bucket's region, or AWS_ENDPOINT_URL to its store"
+# Problem and fix by the server's error code.
+_ADVICE = {
+    code: (problem, fix)
+    for codes, problem, fix in (
+        (
+            "NoSuchBucket",
+            "no such bucket",
+            "Create the bucket, or check its name, AWS_ENDPOINT_URL and AWS_REGION",
+        ),
+        (
+            "ExpiredToken ExpiredTokenException TokenRefreshRequired",
+            "the credentials have expired",
+            f"Set new AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_SESSION_TOKEN, {_RESUME}",
+        ),
+        ("InvalidAccessKeyId", "access denied", "Check AWS_ACCESS_KEY_ID: the store does not know it"),
+        (
+            "SignatureDoesNotMatch",
+            "access denied",
+            "Check AWS_SECRET_ACCESS_KEY: it does not belong to the key's id",
+        ),
+        (
+            "AccessDenied",
+            "access denied",
+            "Allow AWS_ACCESS_KEY_ID to get, put, delete and list in this bucket; see also its retention",
+        ),
+        (
+            "RequestTimeTooSkewed RequestExpired",
+            "this machine's clock differs from the store's",
+            "Set the clock: timedatectl set-ntp true",
+        ),
+        (
+            "AuthorizationHeaderMalformed IllegalLocationConstraintException PermanentRedirect InvalidRegion",
+            "the bucket is in another region",
+            _REGION_FIX,
+        ),
+        (
+            "QuotaExceeded XMinioAdminBucketQuotaExceeded XMinioStorageFull InsufficientStorage",
+            "the store is full",
+            f"Free space in the store or raise its quota, {_RESUME}",
+        ),
+    )
+    for code in codes.split()
+}
 _ENDPOINT_FIX = f"Check AWS_ENDPOINT_URL and the network, {_RESUME}"
 _TRUSTED = r"[A-Za-z][A-Za-z0-9.]{0,60}"
 
@@ -44,6 +89,10 @@ class StoreUnavailable(InputError):
 
     It concerns the whole job, not one shard: the job stops.
     """
+
+
+class StoreRefuses(StoreUnavailable):
+    """An object store that refuses a request: retries cannot succeed, another machine's might."""
 
 
 class NotARegularFile(InputError):
@@ -56,14 +105,43 @@ class FileTooLarge(InputError):
 
 @dataclass(frozen=True)
 class RequestFailure:
-    """The failure of one request to an object store. `is_transient`: a retry may succeed."""
+    """The failure of one request to an object store; `is_transient` where a retry may succeed."""
 
     problem: str
     fix: str
     is_transient: bool
 
     def at(self, place: str) -> StoreUnavailable:
-        return StoreUnavailable(place, "", self.problem, self.fix)
+        kind = StoreUnavailable if self.is_transient else StoreRefuses
+        return kind(place, "", self.problem, self.fix)
+
+
+JOBS_WAIT_S = 300.0  # for which a job repeats a request that its store fails
+_told: list[Callable[[StoreUnavailable], None]] = []
+
+
+@contextmanager
+def repeated_for_minutes(told: Callable[[StoreUnavailable], None] = lambda error: None) -> Generator[None]:
+    """Within the block, requests that a store fails are repeated for `JOBS_WAIT_S`.
+
+    `told` is called, by any thread, with the error of a request that fails for some seconds.
+    """
+    _told.append(told)
+    try:
+        yield
+    finally:
+        _told.remove(told)
+
+
+def tell_repetition(error: StoreUnavailable) -> None:
+    """Report a request that fails for some seconds, and is repeated."""
+    for told in list(_told):
+        told(error)
+
+
+def waits_s() -> float:
+    """Seconds for which this process repeats requests at least."""
+    return JOBS_WAIT_S if _told else 0.0
 
 
 def storage_error(place: str | Path, error: OSError) -> InputError:
@@ -104,17 +182,16 @@ def store_trouble(error: Exception) -> RequestFailure:
     if "//169.254." in text:  # address at which a cloud machine requests its role
         is_busy = status.startswith("5") or status == "429"
         return RequestFailure("no credentials are set", _KEYS_FIX, is_transient=is_busy)
-    if code == "NoSuchBucket":
-        fix = "Create the bucket, or check its name, AWS_ENDPOINT_URL and AWS_REGION"
-        return RequestFailure("no such bucket", fix, is_transient=False)
+    if known := _ADVICE.get(code):
+        problem = known[0] if code == "NoSuchBucket" else f"{known[0]} ({code})"
+        return RequestFailure(problem, known[1], is_transient=False)
     if "Received redirect without LOCATION" in text or status in ("301", "307"):
-        fix = "Set AWS_REGION to the bucket's region, or AWS_ENDPOINT_URL to its store"
-        return RequestFailure("the bucket is in another region", fix, is_transient=False)
-    if status in ("401", "403") or code in ("ExpiredToken", "InvalidAccessKeyId", "InvalidToken"):
+        return RequestFailure("the bucket is in another region", _REGION_FIX, is_transient=False)
+    if status in ("401", "403"):
         return RequestFailure(f"access denied ({code or status})", _KEYS_FIX, is_transient=False)
     if status and not status.startswith("2"):
         shown = f"{status} {code}" if code else status
-        if (status.startswith("5") and status != "501") or status in ("408", "409", "429"):
+        if (status.startswith("5") and status not in ("501", "507")) or status in ("408", "409", "429"):
             fix = f"Wait until the store has recovered, {_RESUME}"
             return RequestFailure(f"the store responds {shown}", fix, is_transient=True)
         fix = "Check that AWS_ENDPOINT_URL is an S3 store that supports this request"

@@ -1,7 +1,7 @@
 """Objects below a prefix of an S3 bucket, through obstore, with bounded retries.
 
 The client's own retries are off, so that one rule holds for every request: transient failures are retried
-with growing pauses until `PATIENCE` timeouts have passed, others are raised at once.
+with growing pauses until `PATIENCE` timeouts have passed, in a job for minutes. Others are raised at once.
 """
 
 from __future__ import annotations
@@ -21,7 +21,13 @@ from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import S3Store
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.storage.errors import RequestFailure, store_trouble, too_large
+from datagen.schemas.storage.errors import (
+    RequestFailure,
+    store_trouble,
+    tell_repetition,
+    too_large,
+    waits_s,
+)
 from datagen.schemas.storage.local_files import StoredFile
 
 TIMEOUT_S = 20.0  # seconds without a response after which a request fails
@@ -94,6 +100,7 @@ def _refuse_endpoint() -> None:
 
 PATIENCE = 1.5  # timeouts for which a request is retried, at least once
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 3.0
+_TOLD_AFTER = 6  # tries, some seconds: short failures are no news
 _DELETED_AT_ONCE = 1000  # limit of S3 per request
 _FAILURES = (BaseError, OSError, ValueError)
 
@@ -217,8 +224,7 @@ class RemoteObjects:
 
     def _try(self, key: str, request: Callable[[], Result]) -> Result:
         """Run a request with retries; FileNotFoundError for a missing object."""
-        end_s = time.monotonic() + PATIENCE * self._timeout_s
-        pause_s, tries = _FIRST_PAUSE_S, 0
+        start_s, pause_s, tries = time.monotonic(), _FIRST_PAUSE_S, 0
         while True:
             try:
                 return request()
@@ -229,8 +235,12 @@ class RemoteObjects:
                 if isinstance(e, FileNotFoundError) and trouble.problem != "no such bucket":
                     raise
                 tries += 1
+                error = trouble.at(f"{self.url}/{key}" if key else self.url)
+                end_s = start_s + max(PATIENCE * self._timeout_s, waits_s())
                 if not trouble.is_transient or (tries > 1 and time.monotonic() + pause_s > end_s):
-                    raise trouble.at(f"{self.url}/{key}" if key else self.url) from e
+                    raise error from e
+                if tries == _TOLD_AFTER:
+                    tell_repetition(error)
             time.sleep(pause_s * random.uniform(0.5, 1.0))
             pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
 
