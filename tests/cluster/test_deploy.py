@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import copy
+import json
+import os
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 import sys
+import tempfile
+import time
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jsonschema
+import psutil
 import pytest
+import ray
 import yaml
 
 from datagen.cli import build_app
+from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, free_port, new_token
+from datagen.jobs.job import _TASK_MEMORY_BYTES
+from tests.faults.test_ray_processes import kill_machine
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEPLOY = REPOSITORY / "datagen" / "cluster" / "deploy"
@@ -89,8 +99,63 @@ def test_the_ray_job_fits_together() -> None:
         mounted = {mount["name"] for mount in container["volumeMounts"]}
         assert mounted == {volume["name"] for volume in pod["volumes"]}
         assert set(container["resources"]["requests"]) == {"cpu", "memory", "ephemeral-storage"}
+        for probe in ("readinessProbe", "livenessProbe"):
+            assert container[probe]["exec"]["command"][:2] == ["python", "-c"]
+    # The autoscaler in the head's pod asks Kubernetes for workers; these need no account.
+    assert cluster["enableInTreeAutoscaling"] is True and workers["minReplicas"] < workers["maxReplicas"]
+    accounts = [group["template"]["spec"].get("automountServiceAccountToken") for group in (head, workers)]
+    assert accounts == [None, False]
+    # What attempts request fits on a worker as often as it has cores.
+    requests = workers["template"]["spec"]["containers"][0]["resources"]["requests"]
+    assert 2 * _TASK_MEMORY_BYTES * int(requests["cpu"]) <= int(requests["memory"].removesuffix("Gi")) * 2**30
     page = PAGE.read_text()
     assert "create secret generic datagen-s3" in page and "network-policy.yaml" in page
+
+
+@pytest.mark.slow
+def test_the_probes_hold_with_nothing_but_python(ray_job: Any, tmp_path: Path) -> None:
+    """Their commands, on a real head that requires a token, where only `python` is on the path."""
+    cluster = ray_job["spec"]["rayClusterSpec"]
+    groups = (cluster["headGroupSpec"], cluster["workerGroupSpecs"][0])
+    containers = [group["template"]["spec"]["containers"][0] for group in groups]
+    probes = [container["readinessProbe"]["exec"]["command"] for container in containers]
+    only_python = {"PATH": str(tmp_path / "bin")}
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "python").symlink_to(sys.executable)
+    agent, dashboard = free_port(), free_port()
+
+    def results() -> list[bool]:
+        ended = list[bool]()
+        for command in probes:
+            words = [w.replace("52365/", f"{agent}/").replace("8265/", f"{dashboard}/") for w in command]
+            done = subprocess.run(words, env=only_python, capture_output=True, check=False)
+            ended.append(done.returncode == 0)
+        return ended
+
+    assert results() == [False, False]  # nothing listens yet
+    session = Path(tempfile.mkdtemp(prefix="dg"))
+    token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": new_token(), "PYTHONPATH": str(REPOSITORY)}
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")} | token
+    head = psutil.Popen(
+        [
+            *(sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block", "--num-cpus=0"),
+            *("--node-ip-address=127.0.0.1", "--port=0", "--include-dashboard=true"),
+            *(f"--dashboard-port={dashboard}", f"--dashboard-agent-listen-port={agent}"),
+            *(f"--ray-client-server-port={free_port()}", f"--temp-dir={session}", "--disable-usage-stats"),
+            f"--object-store-memory={OBJECT_STORE_BYTES}",
+        ],
+        env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+    try:
+        while results() != [True, True]:
+            assert head.poll() is None
+            time.sleep(0.5)
+        (server,) = [p for p in head.children(recursive=True) if p.name() == "gcs_server"]
+        server.suspend()
+        assert not results()[0]  # a head without its server is not ready
+    finally:
+        kill_machine(head)
+        shutil.rmtree(session, ignore_errors=True)
 
 
 def test_only_the_cluster_itself_and_its_operator_may_speak_to_it() -> None:
@@ -110,6 +175,8 @@ def test_the_launcher_takes_the_file_and_ray_its_commands(name: str) -> None:
     from ray.scripts.scripts import cli
 
     config = load_yaml(DEPLOY / "ray" / f"{name}.yaml")
+    schema = json.loads((Path(ray.__file__).parent / "autoscaler" / "ray-schema.json").read_text())
+    jsonschema.validate(config, schema)  # as it is, before Ray completes it
     validate_config(prepare_config(copy.deepcopy(config)))
     with pytest.raises(jsonschema.ValidationError):
         validate_config(prepare_config({**copy.deepcopy(config), "head_commands": []}))
@@ -124,6 +191,38 @@ def test_the_launcher_takes_the_file_and_ray_its_commands(name: str) -> None:
         words = shlex.split(part)
         if words and words[0].endswith("ray"):
             cli.commands[words[1]].make_context(words[1], words[2:], resilient_parsing=False)
+
+
+def test_the_launcher_fills_in_the_aws_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import boto3
+    from moto import mock_aws
+    from ray.autoscaler._private.aws.config import bootstrap_aws
+    from ray.autoscaler._private.util import prepare_config
+
+    for name, value in {
+        "HOME": str(tmp_path),
+        "AWS_ACCESS_KEY_ID": "a",
+        "AWS_SECRET_ACCESS_KEY": "b",
+    }.items():
+        monkeypatch.setenv(name, value)
+    (tmp_path / ".ssh").mkdir()
+    config = load_yaml(DEPLOY / "ray" / "aws.yaml")
+    with mock_aws():
+        filled = bootstrap_aws(prepare_config(copy.deepcopy(config)))
+        assert list(boto3.resource("iam").roles.all()) == []  # Ray's own role could not pass on the workers'
+    nodes = [node["node_config"] for node in filled["available_node_types"].values()]
+    assert len(nodes) == 2
+    for node in nodes:
+        assert node["ImageId"].startswith("resolve:ssm:") and node["IamInstanceProfile"]
+        assert node["SecurityGroupIds"] and node["SubnetIds"] and node["KeyName"]
+
+
+def test_the_head_may_pass_the_role_of_the_workers_on_and_no_other() -> None:
+    policy = json.loads((DEPLOY / "ray" / "aws-head-policy.json").read_text())
+    worker = load_yaml(DEPLOY / "ray" / "aws.yaml")["available_node_types"]["worker"]["node_config"]
+    (passes,) = [rule for rule in policy["Statement"] if rule["Action"] == "iam:PassRole"]
+    assert passes["Effect"] == "Allow"
+    assert passes["Resource"].endswith(f":role/{worker['IamInstanceProfile']['Name']}")
 
 
 # Slurm.
