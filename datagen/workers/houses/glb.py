@@ -21,6 +21,7 @@ MAX_FILE_BYTES = 256 << 20
 MAX_FACES = 500_000
 _MAX_COUNT = 10_000_000  # positions, normals, colours and indices of MAX_FACES loose triangles are fewer
 _MAX_JSON_BYTES = 16 << 20
+_MAX_NODES = 10_000  # with primitives: trimesh looks for the way from the root to each
 _MAX_TEXTURE_PX = 64_000_000
 _FARTHEST = 1e6  # a scene may scale millimetres
 _PLAIN = (180, 178, 174)
@@ -30,7 +31,7 @@ _FIX = "Download the asset again, or remove the scenes that use it."
 # a stride of 0, numbers beyond 64 bits, compressed meshes (NotImplementedError).
 _DAMAGE = (
     ValueError, LookupError, TypeError, AttributeError, OSError, struct.error, RecursionError,
-    NotImplementedError, ArithmeticError, Image.DecompressionBombError,
+    NotImplementedError, ArithmeticError, AssertionError, Image.DecompressionBombError,
 )  # fmt: skip
 
 
@@ -68,9 +69,11 @@ def _check_header(path: Path, data: bytes) -> None:
         raise InputError(path, "", f"has a description of {length:,} bytes", _FIX)
     root = parse_json(data[20 : 20 + length], str(path))
     try:
+        primitives = [p for m in root.value.get("meshes", []) for p in m["primitives"]]
+        parts = len(root.value.get("nodes", [])) + len(primitives)
         counts = [int(a["count"]) for a in root.value.get("accessors", [])]
         # Each primitive becomes its own mesh, even if several share accessors.
-        for primitive in (p for m in root.value.get("meshes", []) for p in m["primitives"]):
+        for primitive in primitives:
             named = [
                 *primitive["attributes"].values(),
                 *[primitive[k] for k in ("indices",) if k in primitive],
@@ -78,6 +81,8 @@ def _check_header(path: Path, data: bytes) -> None:
             counts += [counts[k] for k in named]
     except (ValueError, LookupError, TypeError, AttributeError, OverflowError):
         raise InputError(path, "", "has an invalid description", _FIX) from None
+    if parts > _MAX_NODES:
+        raise InputError(path, "", f"has more than {_MAX_NODES:,} nodes and primitives", _FIX)
     if counts and (min(counts) < 0 or sum(counts) > _MAX_COUNT):
         raise InputError(path, "accessors", "have impossible counts of vertices or indices", _FIX)
 

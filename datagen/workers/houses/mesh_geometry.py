@@ -13,6 +13,7 @@ from datagen.workers.geometry.mesh import F32, F64, Mesh, vertex_components
 
 MAX_PARTS = 32
 _MAX_CORNERS = 64
+_MAX_POINTS = 20_000  # more on one circle take qhull minutes: they are rounded to _THINNEST_M
 _THINNEST_M = 0.004
 _CELL_M = 0.02
 _MAX_CELLS = 250
@@ -49,6 +50,8 @@ def hull_of(points_m: F64) -> F32:
     if size.min() < _THINNEST_M:
         grow = np.where(size < _THINNEST_M, _THINNEST_M / 2, 0.0)
         points_m = np.concatenate([points_m - grow, points_m + grow])
+    if len(points_m) > _MAX_POINTS:
+        points_m = _THINNEST_M * np.unique(np.round(points_m / _THINNEST_M), axis=0)
     try:
         corners = points_m[ConvexHull(points_m).vertices]
     except QhullError:  # flat in a slanted plane: its bounding box has volume

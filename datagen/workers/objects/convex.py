@@ -20,6 +20,7 @@ from datagen.workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
 # A part thinner than this counts as a sheet: physics engines reject it or become unstable.
 MIN_THICKNESS_M = 1e-4
 MAX_PARTS = 1024
+MAX_PART_VERTICES = 10_000  # so many on one circle take qhull 20 s, twice as many four times as long
 # A vertex of a part lies at most so far within the part's hull, plus a share of its size.
 _MAX_DEPTH_M, _MAX_DEPTH_SHARE = 0.002, 0.02
 _MAX_ENCLOSED = 1.2
@@ -68,7 +69,7 @@ def read_convex_parts(path: Path) -> ConvexParts:
     for number, faces in enumerate(groups, 1):
         if problem := _not_convex(vertices, faces):
             fix = "Give a convex decomposition, one `o` group for each part, not the visual mesh"
-            raise InputError(path, f"part {number}", f"not convex: {problem}", fix)
+            raise InputError(path, f"part {number}", problem, fix)
     parts = convex_parts(vertices[np.unique(faces)] for faces in groups)
     if not parts.vertices_m:
         raise InputError(path, "", "every collision part is flat", "Give convex parts with volume")
@@ -93,6 +94,8 @@ def convex_parts(points_m: Iterable[npt.NDArray[np.floating]]) -> ConvexParts:
 def _not_convex(vertices: F64, faces: npt.NDArray[np.int64]) -> str:
     """The problem of a part that its hull does not stand for; "" if the hull does, or the part is flat."""
     points_m = vertices[np.unique(faces)]
+    if len(points_m) > MAX_PART_VERTICES:
+        return f"has more than {MAX_PART_VERTICES:,} vertices"
     try:
         hull = ConvexHull(points_m)
     except (QhullError, ValueError):
@@ -102,11 +105,13 @@ def _not_convex(vertices: F64, faces: npt.NDArray[np.int64]) -> str:
         heights = points_m[start : start + 4096] @ hull.equations[:, :3].T + hull.equations[:, 3]
         depth_m = max(depth_m, float(-heights.max(axis=1).min()))
     if depth_m > _MAX_DEPTH_M + _MAX_DEPTH_SHARE * np.ptp(points_m, axis=0).max():
-        return f"a vertex lies {1000 * depth_m:.0f} mm within its hull"
+        return f"not convex: a vertex lies {1000 * depth_m:.0f} mm within its hull"
     # Cones from a point within to the faces fill a convex body once, whatever the order of corners.
     corners = vertices[np.unique(np.sort(faces, axis=1), axis=0)] - points_m[hull.vertices].mean(axis=0)
-    share = float(np.abs(np.linalg.det(corners)).sum()) / 6 / hull.volume
-    return f"its surface encloses its hull {share:.1f} times" if share > _MAX_ENCLOSED else ""
+    enclosed = float(np.abs(np.linalg.det(corners)).sum()) / 6
+    if enclosed > _MAX_ENCLOSED * hull.volume:
+        return f"not convex: its surface encloses its hull {enclosed / hull.volume:.1f} times"
+    return ""
 
 
 def _read_ply(path: Path) -> tuple[F64, list[npt.NDArray[np.int64]]]:
