@@ -37,6 +37,7 @@ def test_a_finished_run_is_clean_and_its_scenes_are_made_again(
     before = files_of(finished)
     report = verified(finished, capsys, 0, "--replay", "9")
     assert (report["clean"], report["findings"], report["sealed"]) == (True, [], True)
+    assert report["shards_of_other_code"] == 0
     assert report["replay"] == {"asked": 9, "done": True}
     assert report["samples"] == 3 * PER_SCENE
     ledger = report["ledger"]
@@ -44,6 +45,21 @@ def test_a_finished_run_is_clean_and_its_scenes_are_made_again(
     assert files_of(finished) == before
     assert cli.run(["verify", str(finished)]) == 0
     assert "clean" in capsys.readouterr().out
+
+
+def test_a_run_resumed_by_newer_code_of_the_same_versions_is_sound_and_says_so(
+    copied: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    newer = "7" * 64
+    monkeypatch.setattr("datagen.cluster.attempt.code_digest", lambda: newer)
+    made = len(Run.open(copied).committed())
+    assert cli.run(["resume", str(copied), "--n", str(4 * PER_SCENE), *HERE]) == 0
+    report = verified(copied, capsys, 0)
+    added = len(Run.open(copied).committed()) - made
+    assert added > 0 and report["shards_of_other_code"] == added
+    assert cli.run(["verify", str(copied)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"{added} shard" in said and "made by other code than began the run" in said
 
 
 def test_damaged_shards_are_set_aside_and_made_again(
