@@ -1,9 +1,5 @@
 """Make the project's virtual environment, .venv, with the versions that constraints.txt pins.
 
-pip first resolves them without installing, then installs exactly these files: each package of hashes.txt must
-have one of its sha256 there (`--require-hashes`). A package without a line there is named, and installed by
-its version alone; so are all on another system than Linux on x86-64, whose files have other hashes.
-
     python3 scripts/environment.py [EXTRA...]
 
 The extras are those of pyproject.toml; all of them where none is named. Only the standard library is used.
@@ -18,18 +14,13 @@ import hashlib
 import importlib.util
 import json
 import os
-import platform
 import queue
-import re
 import shutil
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 ENVIRONMENT = ROOT / ".venv"
@@ -51,7 +42,7 @@ def fingerprint() -> str:
     required = {key: pyproject[key] for key in ("build-system", "project")}
     required["setuptools"] = pyproject["tool"]["setuptools"]
     parts = [sys.version, sys.prefix, str(ROOT), json.dumps(required, sort_keys=True)]
-    parts += [(ROOT / name).read_text() for name in ("constraints.txt", "hashes.txt")]
+    parts.append((ROOT / "constraints.txt").read_text())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
@@ -158,60 +149,6 @@ class Progress:
         return f"{len(self.found)} packages found" + (f", downloading {self.latest}" if self.latest else "")
 
 
-def known_hashes() -> dict[str, str]:
-    """The lines of hashes.txt by their pin, `name==version`; none where they are of another system."""
-    if (sys.platform, platform.machine()) != ("linux", "x86_64"):
-        return {}
-    lines = (ROOT / "hashes.txt").read_text().splitlines()
-    return {line.split(" ")[0]: line for line in lines if line and not line.startswith("#")}
-
-
-def hashed_and_others(report: Mapping[str, Any], hashes: Mapping[str, str]) -> tuple[list[str], list[str]]:
-    """The requirements of a report of pip that have hashes, and the pins of those that have none.
-
-    Without local parts of versions: a build of torch without CUDA has a hash in the line of its release.
-    """
-    pins = [
-        f"{re.sub(r'[-_.]+', '-', item['metadata']['name']).lower()}=={item['metadata']['version']}"
-        for item in report["install"]
-        if "dir_info" not in item["download_info"]  # this project itself
-    ]
-    public = {pin: pin.partition("+")[0] for pin in pins}
-    known = [hashes[public[pin]].replace(public[pin], pin, 1) for pin in pins if public[pin] in hashes]
-    return known, [pin for pin in pins if public[pin] not in hashes]
-
-
-def install_verified(requirements: list[str]) -> bool:
-    """Install requirements, with all that they need, by the hashes of hashes.txt; False where pip fails."""
-    with tempfile.TemporaryDirectory() as folder:
-        report, pins = Path(folder, "report.json"), ["-c", str(ROOT / "constraints.txt")]
-        # Needed to read the requirements of this project: otherwise pip would fetch it without a hash.
-        builder = _pin("setuptools")
-        if not _install_files(Path(folder), *hashed_and_others(_as_report(builder), known_hashes())):
-            return False
-        resolve = ["--dry-run", "--no-build-isolation", f"--report={report}", *pins, *requirements]
-        if not install(resolve):
-            return False
-        files = hashed_and_others(json.loads(report.read_text()), known_hashes())
-        if files[1]:
-            print(f"without a known hash: {', '.join(files[1])}", flush=True)
-        return _install_files(Path(folder), *files)
-
-
-def _as_report(pin: str) -> dict[str, Any]:
-    name, _, version = pin.partition("==")
-    return {"install": [{"metadata": {"name": name, "version": version}, "download_info": {}}]}
-
-
-def _install_files(folder: Path, hashed: list[str], others: list[str]) -> bool:
-    for name, lines, more in (("hashed", hashed, ["--require-hashes"]), ("others", others, [])):
-        path = folder / f"{name}.txt"
-        path.write_text("\n".join(lines) + "\n")
-        if lines and not install(["--no-deps", *more, "-r", str(path)]):
-            return False
-    return True
-
-
 def _count() -> int:
     return sum(1 for _ in ENVIRONMENT.glob("lib/python*/site-packages/*.dist-info"))
 
@@ -241,10 +178,10 @@ def main(arguments: list[str]) -> int:
     if not present:
         create()
     STAMP.unlink(missing_ok=True)
-    project = ["-e", f"{ROOT}[{extras}]"]
-    done = install_verified(project) and install(["--no-deps", "--no-build-isolation", *project])
+    pins = ["-c", str(ROOT / "constraints.txt")]
+    done = install([*pins, "-e", f"{ROOT}[{extras}]"])
     if done and requested & {"all", "sim"} and sys.version_info >= ALONE_FROM:
-        done = install_verified(["--no-deps", _pin(ALONE)])
+        done = install([*pins, "--no-deps", _pin(ALONE)])
     if not done:
         print("error: pip could not install the pinned libraries; see its message above", file=sys.stderr)
         return 1

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import json
-import re
 import shutil
 import subprocess
 import sys
 import tomllib
 import venv
-import zipfile
 from itertools import chain
 from pathlib import Path
 from types import ModuleType
@@ -42,7 +39,7 @@ def test_they_need_only_the_standard_library(name: str) -> None:
 
 def test_the_stamp_follows_what_is_installed(tmp_path: Path) -> None:
     environment = load("environment")
-    for name in ("pyproject.toml", "constraints.txt", "hashes.txt"):
+    for name in ("pyproject.toml", "constraints.txt"):
         shutil.copy(environment.ROOT / name, tmp_path)
     environment.ROOT = tmp_path
     first = environment.fingerprint()
@@ -57,48 +54,6 @@ def test_the_stamp_follows_what_is_installed(tmp_path: Path) -> None:
     constraints = tmp_path / "constraints.txt"
     constraints.write_text(constraints.read_text() + "extra==1\n")
     assert len({first, second, environment.fingerprint()}) == 3
-
-
-def test_every_pin_has_a_hash_that_pip_must_find() -> None:
-    environment = load("environment")
-    lines = (environment.ROOT / "constraints.txt").read_text().splitlines()
-    pins = {line.partition(";")[0].strip() for line in lines if line and not line.startswith("#")}
-    hashes = environment.known_hashes()
-    assert pins == set(hashes)
-    for pin, line in hashes.items():
-        words = line.split()
-        assert words[0] == pin and len(words) > 1
-        assert all(re.fullmatch(r"--hash=sha256:[0-9a-f]{64}", word) for word in words[1:])
-
-
-def test_a_file_with_another_hash_is_not_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    environment = load("environment")
-    found: dict[str, Any] = {"archive_info": {}}
-    report = {
-        "install": [
-            {"metadata": {"name": "Some_Thing", "version": "1.0+cpu"}, "download_info": found},
-            {"metadata": {"name": "unknown", "version": "2"}, "download_info": found},
-            {"metadata": {"name": "ours", "version": "0"}, "download_info": {"dir_info": {}}},
-        ]
-    }
-    right = "some-thing==1.0 --hash=sha256:" + "a" * 64
-    hashed, others = environment.hashed_and_others(report, {"some-thing==1.0": right})
-    assert (hashed, others) == (["some-thing==1.0+cpu --hash=sha256:" + "a" * 64], ["unknown==2"])
-    # By pip itself: a wheel of one file, with its hash and with another.
-    wheel = tmp_path / "some_thing-1.0-py3-none-any.whl"
-    about = "some_thing-1.0.dist-info"
-    with zipfile.ZipFile(wheel, "w") as packed:
-        packed.writestr("some_thing.py", "")
-        packed.writestr(f"{about}/METADATA", "Metadata-Version: 2.1\nName: some-thing\nVersion: 1.0\n")
-        packed.writestr(f"{about}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
-        packed.writestr(f"{about}/RECORD", "")
-    for name, value in (("NO_INDEX", "1"), ("FIND_LINKS", tmp_path), ("TARGET", tmp_path / "installed")):
-        monkeypatch.setenv(f"PIP_{name}", str(value))
-    digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
-    for given, is_installed in (("0" * 64, False), (digest, True)):
-        lines = [f"some-thing==1.0 --hash=sha256:{given}"]
-        assert environment._install_files(tmp_path, lines, []) == is_installed
-        assert (tmp_path / "installed" / "some_thing.py").exists() == is_installed
 
 
 def project() -> dict[str, Any]:
@@ -167,7 +122,7 @@ def test_in_its_activated_environment_the_interpreter_below_goes_on(tmp_path: Pa
     script = tmp_path / "scripts" / "environment.py"
     script.parent.mkdir()
     shutil.copy(SCRIPTS / "environment.py", script)
-    for name in ("pyproject.toml", "constraints.txt", "hashes.txt"):
+    for name in ("pyproject.toml", "constraints.txt"):
         shutil.copy(SCRIPTS.parent / name, tmp_path)
     venv.create(tmp_path / ".venv", with_pip=False)
     python = tmp_path / ".venv" / "bin" / "python3"
