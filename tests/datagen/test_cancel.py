@@ -130,6 +130,19 @@ def test_cancel_asks_a_silent_job_of_another_host_without_waiting(
     assert Jobs(place).stop_of(record.id) == "drain"
 
 
+def test_cancel_does_not_wait_for_a_job_whose_clock_was_ahead(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from tests.made_runs import make_run
+    from tests.schemas.test_jobs import NOBODY, record_of
+
+    place = make_run(tmp_path / "run", n=10).storage
+    Jobs(place).begin(record_of(datetime.now(UTC) + timedelta(days=1100), NOBODY))
+    assert cli.run(["cancel", str(tmp_path / "run")]) == 0
+    assert "none is running" in capsys.readouterr().out
+    assert cli.run(["verify", str(tmp_path / "run"), "--clean"]) == 0
+
+
 def test_cancel_refuses_a_folder_without_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     refused(["cancel", str(tmp_path), "--head"], capsys, str(tmp_path), "one of the two")
     refused(["cancel"], capsys, "RUN")

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from datagen.cluster.attempt import run_attempt
 from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.protocol import StopRequest
+from datagen.cluster.protocol import ShardTask, StopRequest
 from datagen.cluster.ray_cluster import RaySettings, forget_former_token, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
 from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, head_environment, new_token
+from datagen.cluster.run_recorder import RunRecorder
 from datagen.cluster.shard_policy import RetryPolicy
+from datagen.schemas.run import Run
 from tests.cluster.simulated import Heard, PaperRecorder
 from tests.faults.scripted import ScriptedTask, perform
+from tests.small_runs import make_small_run
 
 pytestmark = pytest.mark.slow
 
@@ -98,3 +102,25 @@ def test_deaths_on_another_machine_leave_their_stacks_in_the_ledger(
     assert "ended by the driver" in first[2].cause
     assert all(e.host is not None and e.host.pid > 0 and e.cost is not None for e in first.values())
     assert left == [] and list(machines.folder.rglob("datagen-notes-*")) == []
+
+
+def test_a_machine_that_does_not_see_the_run_is_named_and_left_out(
+    machines: Machines, tmp_path: Path
+) -> None:
+    run = Run.open(make_small_run(tmp_path / "run", 8))
+    run.grow(64)
+    # One name, which each machine takes for a folder of its own: the first has the run there.
+    (machines.folder / "first" / "home" / "run").symlink_to(tmp_path / "run")
+    said: list[str] = []
+    executor = RayExecutor(run_attempt, replace(machines.settings, tell=said.append), machines.ray)
+
+    def make_task(order: AttemptOrder) -> ShardTask:
+        attempt, spec = order.attempt, run.manifest.spec
+        return ShardTask("~/run", spec, run.layout, order.shard, attempt, "builtin", "builtin", 600.0)
+
+    recorder = RunRecorder(run)
+    summary = drive(run.missing(), make_task, executor, recorder, RetryPolicy(), Heard(), StopRequest())
+    second = executor.others.alive()[machines.second.node_id]
+    assert summary.end == "complete" and not run.missing() and not run.quarantined()
+    assert len(said) == 1 and said[0].startswith(f"left out: machine {second}: ")
+    assert "no such folder" in said[0]
