@@ -19,7 +19,11 @@ def test_the_demo_ends_with_a_picture_of_bases_that_fit_and_with_the_next_comman
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = subprocess.run(
-        ["make", "-n", "demo", f"DEMO={tmp_path}"], cwd=REPOSITORY, capture_output=True, text=True, check=True
+        ["make", "--no-print-directory", "-n", "demo", f"DEMO={tmp_path}"],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     lines = made.stdout.splitlines()
     begin = next(k for k, line in enumerate(lines) if "datagen submit" in line)
