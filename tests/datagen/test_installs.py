@@ -179,7 +179,7 @@ def test_models_are_judged_without_simulators(wheel: Path, tmp_path: Path) -> No
     made = ["submit", "plan", *few, "--config", str(tmp_path / "plan.toml"), "--out", str(tmp_path / "plans")]
     assert cli.run(made) == 0
     write_untrained(tmp_path / "model.ckpt", {})
-    judge = ["evaluate", "model.ckpt", "plans"]
+    judge = ["evaluate", "model.ckpt", "plans", "--full"]
     judged, no_sim = train.run(judge, [*judge, "--baselines", "reachability"])
     assert judged.code == 0, judged
     assert "[sim]" in "".join(judged.out.split())  # why `reachability` is left out

@@ -209,6 +209,11 @@ def _damaged_records(folder: Path) -> None:
     (folder / "copies/plans/1.json").write_bytes(b"")
 
 
+def _damaged_store(folder: Path) -> None:
+    seal(make_run(folder, 20).storage)
+    flip(folder / SEALED / "house_id/zarr.json")
+
+
 def _damaged_manifest(folder: Path) -> None:
     make_run(folder, 20)
     flip(folder / "manifest.json")
@@ -218,7 +223,6 @@ def _damaged_files(folder: Path) -> None:
     seal(make_run(folder, 30).storage)
     flip(folder / "shards/a-1.zip")
     (folder / "shards/a-2.zip").unlink()
-    flip(folder / SEALED / "house_id/zarr.json")
 
 
 def _repair_and_resume(folder: Path) -> None:
@@ -288,6 +292,7 @@ OPERATIONS = (
     Operation("merge sizes", lambda f: _apart(f, sizes=(2, 1)), _merge, places=("out",)),
     Operation("repair manifest", _damaged_manifest, _repair),
     Operation("repair records", _damaged_records, _repair),
+    Operation("repair store", _damaged_store, _repair),
     Operation("repair files", _damaged_files, _repair_and_resume),
     Operation("clean", _littered, _clean, exact=True),
     Operation("relabel", _relabelled, _relabel, places=("out",), fields=_KEPT_TO_RELABEL),
