@@ -228,7 +228,8 @@ class Run:
         """Write an attempt's rows durably, and return the entry for its commit."""
         if len(data) > MAX_FILE_BYTES:
             problem = f"has {len(data):,} bytes, more than 2 GiB"
-            raise InputError(f"shard of attempt {attempt}", "", problem, "Choose fewer --scenes-per-shard")
+            fix = "Give fewer --candidates-per-scene, or fewer observation.n_points in --config"
+            raise InputError(f"shard of attempt {attempt}", "", problem, fix)
         if not self.storage.put_new(object_key(attempt), data):
             place = f"{self.storage.url}/{object_key(attempt)}"
             raise InputError(place, "", "exists already", "Give every attempt its own name")

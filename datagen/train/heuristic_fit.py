@@ -27,7 +27,7 @@ RESAMPLES = 1000
 _DECIMALS = 4
 _FITTED = ("mu", "sigma_l", "sigma_r", "tau")
 _SIGMAS = (0.01, 2.0)
-_POPULATION, _GENERATIONS = 30, 200
+_POPULATION, _GENERATIONS = 60, 100
 
 
 @dataclass(frozen=True, eq=False)
