@@ -46,12 +46,12 @@ _STEP_M = 0.001
 REACH_STEP_M = 0.01
 _LIBRARIES = ("numpy", "scipy", "embreex", "sapien", "pybullet", "zarr", "obstore", "ray", "trimesh")
 # A shard has at most a minute of work, which a lost attempt repeats, and at most tens of megabytes; enough
-# work that 40 ms of writing are little; and so many shards that the workers share a run evenly.
+# work that 40 ms of writing are little; and no larger a part of the run than lets workers share it evenly.
 _LONGEST_S, _SHORTEST_S = 60.0, 2.0
 _MOST_BYTES = 32 * 2**20
 _SHARDS, _SHARDS_AT_LEAST = 64, 8
 # Core seconds of a label, scene included, and bytes of a cloud's point (docs/results/speed.md).
-_LABEL_S = {"heuristic": 0.002, "plan": 0.02, "sim": 0.5}
+_LABEL_S = {"heuristic": 0.002, "plan": 0.03, "sim": 0.1}
 _POINT_BYTES = 10
 
 
