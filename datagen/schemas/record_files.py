@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.run_records import FORMAT_VERSION, AttemptStart, LedgerEntry, Manifest
+from datagen.schemas.run_records import FORMAT_VERSION, AttemptStart, Commit, LedgerEntry, Manifest
 from datagen.schemas.storage import Storage
 from datagen.schemas.storage.errors import NotARegularFile
 
@@ -257,6 +257,20 @@ def lost_end(start: AttemptStart, ended: str = "", cause: str = LOST_CAUSE) -> L
         cause=cause,
         started=start.started,
         ended=ended,
+    )
+
+
+def superseded_end(commit: Commit, cause: str, started: str = "") -> LedgerEntry:
+    """The end record of an attempt whose commit does not count any more, with the commit's cost."""
+    return LedgerEntry(
+        attempt=commit.attempt,
+        shard=commit.shard,
+        outcome="superseded",
+        cause=cause,
+        started=started,
+        ended=commit.created,
+        cost=commit.cost,
+        host=commit.host,
     )
 
 

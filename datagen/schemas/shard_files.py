@@ -33,7 +33,8 @@ from datagen.schemas.specification import Specification
 Array = npt.NDArray[Any]
 
 ZSTD_LEVEL = 3
-_FILE_BYTES = {True: 64 * 2**20, False: 8 * 2**20}  # uncompressed, of clouds and of other arrays
+# Uncompressed, of a sealed store's files: of clouds, whose rows are large, and of other arrays.
+_CLOUD_FILE_BYTES, _FILE_BYTES, _LARGE_ROW_BYTES = 64 * 2**20, 8 * 2**20, 2**10
 MAX_CHUNK_BYTES = 4 * 2**20  # of uncompressed numbers; keeps random reads of single clouds cheap
 MAX_TEXT_BYTES = 4096  # the longest name
 
@@ -50,16 +51,22 @@ def chunk_rows(schema: RecordSchema, field: Field, rows: int) -> int:
     """
     if field.is_text:
         return rows
-    row_bytes = int(np.prod(schema.shape(field, 1))) * np.dtype(field.dtype).itemsize
-    most = max(1, MAX_CHUNK_BYTES // row_bytes)
+    most = max(1, MAX_CHUNK_BYTES // _row_bytes(schema, field))
     return next(c for c in range(min(rows, most), 0, -1) if rows % c == 0)
 
 
 def _chunks_per_file(schema: RecordSchema, field: Field, step: int, rows: int) -> int:
     """Chunks of `step` rows in each file of a sealed array."""
-    row_bytes = 64 if field.is_text else int(np.prod(schema.shape(field, 1))) * np.dtype(field.dtype).itemsize
-    most = _FILE_BYTES[row_bytes >= 2**10] // (row_bytes * step)
-    return max(1, min(most, -(-rows // step)))
+    row_bytes = _row_bytes(schema, field)
+    most = _CLOUD_FILE_BYTES if row_bytes >= _LARGE_ROW_BYTES else _FILE_BYTES
+    return max(1, min(most // (row_bytes * step), -(-rows // step)))
+
+
+def _row_bytes(schema: RecordSchema, field: Field) -> int:
+    """Bytes of a row; of text an estimate."""
+    if field.is_text:
+        return 64
+    return int(np.prod(schema.shape(field, 1))) * np.dtype(field.dtype).itemsize
 
 
 def chunk_key(field: Field, index: int) -> str:

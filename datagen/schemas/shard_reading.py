@@ -89,7 +89,7 @@ class ShardPlace:
 
 def committed_place(run: Run, commit: Commit, rows: Rows | None = None) -> ShardPlace:
     """The wanted rows [all] of a committed shard."""
-    source = ShardObject(run, commit.attempt, commit.object.size, commit.object.sha256)
+    source = ShardObject(run, commit.object)
     wall_s = commit.cost.all_s["wall"] / max(commit.samples, 1)
     rows = Rows(0, commit.scenes, commit.samples) if rows is None else rows
     return ShardPlace(source, 0, rows, commit.scenes, commit.samples, wall_s)

@@ -6,7 +6,6 @@ import io
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from hashlib import sha256
 from typing import Protocol
 
 import google_crc32c
@@ -14,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.record_files import object_key
 from datagen.schemas.run import Run
+from datagen.schemas.run_records import FileEntry
 from datagen.schemas.safe_files import DAMAGED_ZIP
 from datagen.schemas.storage import Storage
 from datagen.schemas.stored_arrays import (
@@ -44,14 +43,12 @@ class ShardObject:
     """The committed object of one shard. Its sha256 is checked when it is first read."""
 
     run: Run
-    attempt: str
-    size: int
-    sha256: str
+    entry: FileEntry  # of the commit
     is_checked: bool = False
 
     @property
     def url(self) -> str:
-        return f"{self.run.storage.url}/{object_key(self.attempt)}"
+        return f"{self.run.storage.url}/shards/{self.entry.path}"
 
     def metadata(self, names: Sequence[str]) -> dict[str, StoredArray]:
         files = self._open()
@@ -66,12 +63,7 @@ class ShardObject:
             yield f"{self.url}/{path}", files.get(path)
 
     def _open(self) -> ZipFiles:
-        data = self.run.storage.get(object_key(self.attempt), self.size)
-        problem = "no such file" if data is None else ""
-        if data is not None and not self.is_checked and sha256(data).hexdigest() != self.sha256:
-            problem = f"has {len(data)} bytes with another sha256 than the commit"
-        if data is None or problem:
-            raise InputError(self.url, "", problem, DAMAGE_FIX)
+        data = self.run.read_rows(self.entry, check=not self.is_checked)
         self.is_checked = True
         return ZipFiles(self.url, data)
 

@@ -118,7 +118,7 @@ def of(run: Run, *shards: int) -> list[tuple[Run, int]]:
 
 
 def expected(shards: Iterable[tuple[Run, int]], scenes: int | None = None, n: int | None = None) -> Arrays:
-    """The rows that shards were given, one after the other, cut to so many scenes and samples."""
+    """The rows that shards were given, one after the other, cut to these numbers of scenes and samples."""
     tables = [rows_of(run, shard) for run, shard in shards]
     return {
         name: np.concatenate([each[t][name] for each in tables])[:rows]

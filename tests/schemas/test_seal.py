@@ -86,7 +86,8 @@ def test_chunks_of_shards_lie_unchanged_in_files_of_several(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shard_files, "MAX_CHUNK_BYTES", 1000)  # real clouds would take gigabytes
-    monkeypatch.setattr(shard_files, "_FILE_BYTES", {True: 2000, False: 2000})
+    for name in ("_FILE_BYTES", "_CLOUD_FILE_BYTES"):
+        monkeypatch.setattr(shard_files, name, 2000)
     clear_metadata()
     try:
         run = make_run(tmp_path, n=75, scenes_per_shard=6)

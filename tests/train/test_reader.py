@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from datagen.reports.agreement import read_labels
-from datagen.schemas import shard_sources
+from datagen.schemas import run as run_module
 from datagen.schemas.errors import InputError
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_reading import read_scene
@@ -160,7 +160,7 @@ def test_an_object_is_checked_against_its_commit_once_per_process(
         hashed.append(len(data))
         return sha256(data)
 
-    monkeypatch.setattr(shard_sources, "sha256", counted)
+    monkeypatch.setattr(run_module, "sha256", counted)
     reader = SampleReader([tmp_path], ("points_m",), ("label",))
     first = list(reader.shards())
     assert len(hashed) == 2

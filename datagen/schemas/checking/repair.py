@@ -16,9 +16,9 @@ from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.cleaning import refuse_running
 from datagen.schemas.checking.finding import Finding, Reseal, Restore, SetAside, read
 from datagen.schemas.errors import InputError
-from datagen.schemas.record_files import SET_ASIDE, commit_key, object_key
+from datagen.schemas.record_files import SET_ASIDE, commit_key, object_key, superseded_end
 from datagen.schemas.run import Run, label_counts, open_runs
-from datagen.schemas.run_records import Commit, LedgerEntry, foreign_field
+from datagen.schemas.run_records import MAX_FILE_BYTES, Commit, foreign_field
 from datagen.schemas.sealing import CLAIM, remove_store, seal, store_record
 from datagen.schemas.sealing.contents import RECORD, SEALED
 from datagen.schemas.shard_ranges import ShardRanges
@@ -28,7 +28,6 @@ from datagen.schemas.storage import Storage
 _PASSES = 6
 # Kinds of findings that do not keep a run from being sealed.
 _HARMLESS = ("account", "sealed", "stale")
-_MOST_BYTES = 2**31  # of a file that is set aside
 _CAUSE = "its shard was set aside by datagen verify --repair"
 
 Seen = Callable[[int, int], None]
@@ -39,7 +38,7 @@ class Repaired:
     """The result of a repair: keys relative to the checked path, and the findings that are left."""
 
     restored: list[str] = field(default_factory=list[str])
-    set_aside: list[str] = field(default_factory=list[str])  # folders of shards, and single files
+    set_aside: list[str] = field(default_factory=list[str])  # commits of shards, and single files
     into: str = ""  # the folder that holds what was set aside
     resealed: bool = False
     left: list[Finding] = field(default_factory=list[Finding])
@@ -114,23 +113,13 @@ def _set_aside(storage: Storage, key: str, finding: Finding, into: str) -> None:
     rows = f"{_prefix(storage, run)}{object_key(commit.attempt)}" if commit else ""
     _move(storage, [rows, key] if rows else [key], into)  # the commit last: without it nothing is found
     if commit is not None:
-        run.ledger.end(
-            LedgerEntry(
-                attempt=commit.attempt,
-                shard=commit.shard,
-                outcome="superseded",
-                cause=_CAUSE,
-                ended=commit.created,
-                cost=commit.cost,
-                host=commit.host,
-            )
-        )
+        run.ledger.end(superseded_end(commit, _CAUSE))
 
 
 def _move(storage: Storage, keys: Iterable[str], into: str) -> None:
     """Move files into a folder: each exists there, durably, before it is removed."""
     for key in keys:
-        data = storage.get(key, _MOST_BYTES)
+        data = storage.get(key, MAX_FILE_BYTES)
         if data is not None:
             storage.put_new(f"{into}/{key}", data)
             storage.delete([key])

@@ -31,9 +31,10 @@ from datagen.schemas.record_files import (
     object_key,
     publish,
     refuse_foreign,
+    superseded_end,
 )
 from datagen.schemas.run import Run, label_counts, open_runs
-from datagen.schemas.run_records import Commit, LedgerEntry, Merged, MergedPart, Plan
+from datagen.schemas.run_records import Commit, Merged, MergedPart, Plan
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage, open_storage
 
@@ -51,7 +52,7 @@ class MergePlan:
 
     @property
     def records(self) -> int:
-        """The shards to write, and at most so many attempts."""
+        """How many shards there are to write."""
         return sum(len(part.kept) for part in self.parts)
 
 
@@ -157,7 +158,8 @@ def _write(part: Part, run: Run, tick: Tick) -> WrittenPart:
     _copy_records(others, run, {end_key(commit.attempt) for _, commit in part.kept.values()})
     for source, commit in part.spare:
         if run.commit_of(commit.shard).attempt != commit.attempt:
-            run.ledger.end(_end_of_spare(part.runs[source], commit))
+            start = part.runs[source].ledger.start_of(commit.attempt)
+            run.ledger.end(superseded_end(commit, SPARE_CAUSE, start.started if start else ""))
     run.close_lost_attempts()  # of shards that another source has
     return WrittenPart(run, len(there), len(new), len(part.spare))
 
@@ -188,20 +190,6 @@ def _copy_records(sources: Sequence[Run], run: Run, but: Container[str]) -> None
         keys = sorted(key for key, runs in held.items() if runs[0] is source)
         for _ in run.storage.concurrent_map(put, source.storage.get_many(keys, MAX_RECORD_BYTES)):
             pass
-
-
-def _end_of_spare(source: Run, commit: Commit) -> LedgerEntry:
-    start = source.ledger.start_of(commit.attempt)
-    return LedgerEntry(
-        attempt=commit.attempt,
-        shard=commit.shard,
-        outcome="superseded",
-        cause=SPARE_CAUSE,
-        started=start.started if start else "",
-        ended=commit.created,
-        cost=commit.cost,
-        host=commit.host,
-    )
 
 
 def _existing_storage(out: str) -> Storage | None:

@@ -20,7 +20,7 @@ from datagen.workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
 # A part thinner than this counts as a sheet: physics engines reject it or become unstable.
 MIN_THICKNESS_M = 1e-4
 MAX_PARTS = 1024
-MAX_PART_VERTICES = 10_000  # so many on one circle take qhull 20 s, twice as many four times as long
+MAX_PART_VERTICES = 10_000  # on one circle they take qhull 20 s, and twice the number four times as long
 # A vertex of a part lies at most so far within the part's hull, plus a share of its size.
 _MAX_DEPTH_M, _MAX_DEPTH_SHARE = 0.002, 0.02
 _MAX_ENCLOSED = 1.2
