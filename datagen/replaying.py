@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from datagen.cluster.attempt_guard import this_host
-from datagen.console.options import AS_FOUND, Sources
+from datagen.console.options import AS_FOUND, AssetSources, Sources
 from datagen.schemas.checking.finding import Finding
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import Field
@@ -25,15 +25,21 @@ Array = np.ndarray[Any, Any]
 
 
 def open_sources(run: Run, given: Sources = AS_FOUND) -> tuple[World, Run | None]:
-    """Open the houses and objects of a run, and the run whose scenes it labelled, or None.
+    """Open the houses, objects and robot of a run, and the run whose scenes it labelled, or None.
 
     They are those given, else those in its manifest. InputError where they do not exist, or differ from those
     that the run was made from.
     """
-    spec, known = run.manifest.spec, run.manifest.sources
-    houses, objects = (known.get(name, "builtin") for name in ("houses", "objects"))
-    world = open_world(spec, given.houses or houses, given.objects or objects)
+    spec = run.manifest.spec
+    world = open_world(spec, *places_of(run, given))
     return world, source_of(run, given) if spec.scenes_from is not None else None
+
+
+def places_of(run: Run, given: AssetSources = AS_FOUND) -> tuple[str, str, str]:
+    """Where houses, objects and the robot's file of a run are: as given, else as in its manifest."""
+    known = run.manifest.sources
+    houses, objects = (known.get(name, "builtin") for name in ("houses", "objects"))
+    return given.houses or houses, given.objects or objects, given.robot or known.get("robot", "")
 
 
 def source_of(run: Run, given: Sources = AS_FOUND) -> Run:
@@ -82,9 +88,7 @@ def _opened(run: Run, given: Sources) -> tuple[World, Run]:
     except InputError:
         if run.manifest.spec.scenes_from is None or given.scenes_from is not None:
             raise
-        known = run.manifest.sources
-        houses, objects = (known.get(name, "builtin") for name in ("houses", "objects"))
-        return open_world(run.manifest.spec, given.houses or houses, given.objects or objects), run
+        return open_world(run.manifest.spec, *places_of(run, given)), run
     return world, source or run
 
 

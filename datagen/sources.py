@@ -18,13 +18,13 @@ class Registry(Generic[T]):
     """Names, each with an object that is loaded on access.
 
     `list(registry)` gives the names, and `registry[name]` loads one. An unknown name raises InputError with
-    the valid ones. A name may also be `module:attribute` outside the package.
+    the valid ones. A name may also be `module:attribute` outside the package; a robot's, its file ROBOT.toml.
 
     Examples:
         >>> list(datagen.robots)
-        ['fetch', 'panda', 'panda-scaled', 'xarm7']
+        ['fetch', 'panda', 'panda-scaled', 'pr2', 'stretch3', 'tiago-pro', 'ur5', 'xarm7']
         >>> datagen.robots["fetch"].reach_m
-        (1.11, 1.11)
+        (1.258, 1.258)
         >>> datagen.houses["builtin:3"].house_ids()
         ['builtin-0000', 'builtin-0001', 'builtin-0002']
     """

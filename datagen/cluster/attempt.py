@@ -68,7 +68,7 @@ def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:
     """
     with ends_job(every_input_error=True):
         refuse_other_code(task.code_digest)
-        run, world = _open(task.run, task.spec.hash(), task.houses, task.objects, task.probe)
+        run, world = _open(task.run, task.spec.hash(), task.houses, task.objects, task.robot, task.probe)
         scenes_run = _open_scenes_run(task.scenes_from, task.spec.scenes_hash) if task.scenes_from else None
     return run, world, scenes_run
 
@@ -93,15 +93,15 @@ def ends_job(every_input_error: bool = False) -> Generator[None]:
 
 
 @lru_cache(maxsize=1)  # a worker serves one run at a time, and a world is large
-def _open(path: str, spec_hash: str, houses: str, objects: str, probe: str) -> tuple[Run, World]:
+def _open(path: str, spec_hash: str, houses: str, objects: str, robot: str, probe: str) -> tuple[Run, World]:
     run = Run.open(path)
     if run.manifest.spec_hash != spec_hash:
         raise InputError(path, "spec_hash", "the run now has another specification", "Submit to a new --out")
     refuse_unfit_machine(run, probe)
-    arm = run.manifest.spec.arm
+    world, arm = open_world(run.manifest.spec, houses, objects, robot), run.manifest.spec.arm
     if arm is not None:
-        gripper_of(arm.robot)  # broken robot files concern every shard
-    return run, open_world(run.manifest.spec, houses, objects)
+        gripper_of(arm.robot_key)  # broken robot files concern every shard
+    return run, world
 
 
 @lru_cache(maxsize=1)

@@ -50,6 +50,7 @@ class ShardTask:
     houses: str  # source reference as on the command line: `builtin`, `procthor:DIR`
     objects: str
     deadline_s: float
+    robot: str = ""  # place of the robot's file; "" for one of the registry
     notes: str = ""
     scenes_from: str = ""  # folder or URL of the run whose scenes are labelled again; "" for new scenes
     probe: str = ""  # a file of the run by which machines recognize it; "" for none

@@ -9,6 +9,7 @@ from datagen.configuration.specify import refuse_missing_packages
 from datagen.console.options import AS_FOUND, AssetSources, RunPath, Whole, refuse_output
 from datagen.console.printing import print_rows
 from datagen.drawing.scene_picture import Shown, draw_scene_picture
+from datagen.replaying import places_of
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import find_scene, open_runs
 from datagen.schemas.shard_reading import read_scene
@@ -37,15 +38,14 @@ def show(
     is_trial = trial is not None or out.suffix.lower() == ".gif"
     candidate = _candidate(trial)
     opened, found = find_scene(open_runs(run), scene)
-    spec, sources = opened.manifest.spec, opened.manifest.sources
+    spec = opened.manifest.spec
     if is_trial and spec.arm is None:
         problem = f"{spec.label_source} labels have no trials"
         fix = "Name a run of plan or sim labels, or give only --out FILE.png"
         raise InputError(run, "--trial" if trial is not None else "--out", problem, fix)
     refuse_missing_packages(spec.label_source)
     rows = read_scene(opened, found)
-    houses = given.houses or sources.get("houses", "builtin")
-    world = open_world(spec, houses, given.objects or sources.get("objects", "builtin"))
+    world = open_world(spec, *places_of(opened, given))
     shown = Shown(run, spec, rows, reconstruct_scene(world, rows.record))
     if is_trial:
         # Imported here, so that scenes are drawn without the libraries for planning and trials.

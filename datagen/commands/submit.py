@@ -107,7 +107,7 @@ class SubmitOptions(JobOptions):
     robot: Annotated[
         str | None,
         option(
-            "fetch, panda, panda-scaled or xarm7; sets reach and height. "
+            "Name of a robot, or its file ROBOT.toml; sets reach and height. "
             "[default: any for heuristic, panda-scaled for plan and sim]",
             ROBOT,
         ),
@@ -182,7 +182,8 @@ def submit(options: SubmitOptions) -> JobResult:
     if options.detach:
         return detach_job(words_to_resume(path, in_ray_job(options)), path, options)
     sources = manifest.sources
-    job_run = JobRun(run, sources["houses"], sources["objects"], sources.get("scenes_from", ""))
+    more = sources.get("scenes_from", ""), sources.get("robot", "")
+    job_run = JobRun(run, sources["houses"], sources["objects"], *more)
     again = words_to_resume(path, options)
     return Job(run.storage, path, [job_run], options, began_s, words, again).run()
 
@@ -218,13 +219,17 @@ def _specified(options: SubmitOptions, shown: Progress) -> tuple[Run | None, Man
         )
         spec = specify_again(label_source, stored, config, *chosen)
         houses, objects = stored.houses, stored.objects
-        world = open_world(spec, houses, objects)
+        world = open_world(spec, houses, objects, options.robot or stored.robot)
         refuse_unusable_engines(spec, options.address)
         layout = layout_again(spec, stored, options.n) if run is None else run.layout
         refuse_too_few(stored, layout, options.n)
         known = stored.run.manifest.sources
         stored_in = {**known, "scenes_from": stored.run.storage.url}
+        if options.robot is not None:
+            stored_in.pop("robot", None)
     sources = {"houses": absolute_source(houses), "objects": absolute_source(objects)}
+    if spec.arm is not None and options.robot is not None and options.robot.endswith(".toml"):
+        sources["robot"] = options.robot
     manifest = manifest_of(spec, layout, stored_in | sources)
     if run is not None:
         refuse_other(run.storage.url, run.manifest, manifest)

@@ -82,7 +82,7 @@ def _replay(
     # Simulators are imported only for --replay.
     from datagen.replaying import replay_findings
 
-    sources = Sources(houses=given.houses, objects=given.objects)
+    sources = Sources(houses=given.houses, objects=given.objects, robot=given.robot)
     with counting("scenes made again", as_json=json) as seen:
         for run, finding in replay_findings(checked.runs, count, sources, seen):
             folder = run.storage.url.removeprefix(storage.url).strip("/")

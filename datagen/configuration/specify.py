@@ -30,9 +30,8 @@ from datagen.workers.extras import how_to_get, versions_of
 from datagen.workers.houses.house import HouseSource
 from datagen.workers.labels import load_label_source
 from datagen.workers.objects.model import ObjectSource
-from datagen.workers.registry import allow, entry
 from datagen.workers.rendering import RENDERERS, load_renderer
-from datagen.workers.robots import ROBOTS, robot_limits
+from datagen.workers.robots import coordinates_of, remember, robot_digest, robot_limits, robot_source
 from datagen.workers.settling import SETTLERS, first_settler, load_settler
 
 Fields = dict[str, Any]
@@ -219,11 +218,10 @@ def complete_arm(
         if section in arm:
             problem = f"{label_source} runs no trials"
             raise InputError(place, f"arm.{section}", problem, "Remove the section, or submit sim")
-    if robot is not None:
-        arm["robot"] = robot
-    elif isinstance(named := arm.get("robot"), str):
-        allow([named])  # from the user's own file
-        entry(ROBOTS, named, f"{place}: arm.robot")
+    named = robot or arm.get("robot", ArmParams().robot)
+    if isinstance(named, str):
+        is_known = robot is None and "robot_digest" in arm
+        put_robot(arm, f"{named}@{arm['robot_digest']}" if is_known else named)
     if label_source == "sim":
         arm.setdefault("trial", {})
     if repeats is not None:
@@ -232,13 +230,27 @@ def complete_arm(
             disturbance["repeats"] = repeats
 
 
+def put_robot(arm: Fields, name: str) -> None:
+    """Set the robot of the section `arm`, and what labels depend on. InputError for an unknown one."""
+    source, digest = robot_source(name), robot_digest(name)
+    if digest is not None:
+        remember(name, source.name, digest)
+    count = coordinates_of(name)
+    known = {"robot": source.name, "robot_digest": digest, "joints": None if count == 7 else count}
+    for key, value in known.items():
+        if value is None:
+            arm.pop(key, None)
+        else:
+            arm[key] = value
+
+
 def robot_of(fields: Fields, robot: str | None) -> str | None:
     """The robot that candidates must suit: --robot, or that of the arm; None for any."""
     arm = fields.get("arm")
     if robot is not None or not isinstance(arm, dict):
         return robot
-    named = arm.get("robot", ArmParams().robot)
-    return named if isinstance(named, str) else None
+    named, digest = arm.get("robot", ArmParams().robot), arm.get("robot_digest")
+    return None if not isinstance(named, str) else named if digest is None else f"{named}@{digest}"
 
 
 def narrow_candidates(fields: Fields, robot: str) -> None:

@@ -22,6 +22,7 @@ from datagen.schemas.run_records import Layout
 from datagen.schemas.shard_reading import committed_scenes
 from datagen.schemas.specification import Specification
 from datagen.workers.engine_versions import ARM_PACKAGES, label_engines, scene_engine_names
+from datagen.workers.robots import remember
 
 # Sections that a configuration may set for stored scenes.
 _LABEL_SECTIONS = ("arm", "heuristic", "visibility")
@@ -34,6 +35,7 @@ class StoredScenes:
     run: Run
     houses: str  # source references
     objects: str
+    robot: str = ""  # place of the robot's file; "" for one of the registry
 
     @property
     def candidates_per_scene(self) -> int:
@@ -59,9 +61,11 @@ def open_stored_scenes(
     run = Run.open(path)
     _ = run.schema  # InputError for stores of another version, whose rows do not fit
     sources = run.manifest.sources
-    return StoredScenes(
-        run, houses or sources.get("houses", "builtin"), objects or sources.get("objects", "builtin")
-    )
+    arm, robot = run.manifest.spec.arm, sources.get("robot", "")
+    if arm is not None and arm.robot_digest is not None:
+        remember(robot or arm.robot, arm.robot, arm.robot_digest)
+    here = houses or sources.get("houses", "builtin"), objects or sources.get("objects", "builtin")
+    return StoredScenes(run, *here, robot)
 
 
 def specify_again(

@@ -101,6 +101,11 @@ def absolute_source(ref: str) -> str:
     return refuse_not_utf8(f"{kind}:{Path(text).expanduser().resolve()}" if is_path else ref)
 
 
+def absolute_robot(robot: str | Path) -> str:
+    """A robot's name, or the path of its file made absolute."""
+    return absolute_path(robot) if str(robot).endswith(".toml") else str(robot)
+
+
 def absolute_path(path: str | Path) -> str:
     """A run's absolute path or its address, valid in every folder."""
     path = str(path)

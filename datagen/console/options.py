@@ -64,10 +64,11 @@ def refuse_output(file: Path, option: str, *endings: str) -> None:
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class AssetSources:
-    """References of houses and objects from the command line; None: those in the run's manifest."""
+    """References of houses, objects and a robot's file; None: those in the run's manifest."""
 
     houses: Annotated[str | None, Parameter(help="New location of the houses.")] = None
     objects: Annotated[str | None, Parameter(help="New location of the objects.")] = None
+    robot: Annotated[str | None, Parameter(help="New location of the robot's file.")] = None
 
 
 @Parameter(name="*")

@@ -8,7 +8,7 @@ import numpy as np
 
 from datagen.workers.furniture.solids import frustum, join
 from datagen.workers.geometry.mesh import F64, I32, Mesh
-from datagen.workers.geometry.transforms import inverse, translation
+from datagen.workers.geometry.transforms import inverse
 from datagen.workers.rendering.embree import RayMesh, ray_mesh
 from datagen.workers.robots.robot import Robot
 
@@ -24,32 +24,34 @@ class RobotBodies:
     rays: tuple[RayMesh, ...]  # (B,)
     radii_m: F64  # (B,), around the bodies' origins
     link: I32  # (B,), row of the link; -1 for the pedestal
-    finger_side: I32  # (B,), +1 and -1 for bodies that move with finger 0 and 1, else 0
+    finger: I32  # (B,), row among the gripper's bodies of those that its fingers are, else 0
 
     def poses(self, T_world_base: F64, q_rad: F64, opening_m: float) -> F64:
         """Poses (B, 4, 4) in the world for joints (A,) and the opening between the pads (m)."""
         T_base_link = np.concatenate([self.robot.T_base_link(q_rad), np.eye(4)[None]])
         T_base_tcp = self.robot.T_base_tcp(q_rad)
         out = T_world_base @ T_base_link[self.link]
+        # Links are posed with the hand fully open.
+        here, open_wide = self.robot.gripper.body_poses(
+            np.array([opening_m, self.robot.gripper.max_opening_m])
+        )
         for k in self.hand:
-            # Links are posed with the hand fully open; fingers slide along y of the TCP.
-            slide_m = float(self.finger_side[k]) * (opening_m - self.robot.gripper.max_opening_m) / 2
-            slide = T_base_tcp @ translation(0.0, slide_m, 0.0) @ inverse(T_base_tcp)
-            out[k] = T_world_base @ slide @ T_base_link[self.link[k]]
+            moved = T_base_tcp @ here[self.finger[k]] @ inverse(T_base_tcp @ open_wide[self.finger[k]])
+            out[k] = T_world_base @ moved @ T_base_link[self.link[k]]
         return out
 
     @property
     def hand(self) -> list[int]:
         """Rows of the finger bodies."""
-        return np.flatnonzero(self.finger_side).tolist()
+        return np.flatnonzero(self.finger).tolist()
 
 
 def robot_bodies(robot: Robot, pedestal_radius_m: float) -> RobotBodies:
     """The robot's bodies, with a pedestal for robots without a base of their own."""
-    sides = dict(zip(robot.link_names[-2:], (1, -1), strict=True))
+    palm = robot.first_hand_link
     bodies = [
-        (_coloured(mesh) if name in sides else mesh, k, sides.get(name, 0))
-        for k, (name, mesh) in enumerate(zip(robot.link_names, robot.link_meshes(), strict=True))
+        (_coloured(mesh) if k > palm else mesh, k, max(k - palm, 0))
+        for k, mesh in enumerate(robot.link_meshes())
         if len(mesh.faces)
     ]
     if robot.base_radius_m is None:

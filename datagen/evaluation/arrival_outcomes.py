@@ -71,6 +71,7 @@ class SceneTask:
     spec: Specification
     houses: str
     objects: str
+    robot: str
     scene: int
     mode: str
     seed: int
@@ -176,7 +177,7 @@ def make_arrivals(task: SceneTask, stopping: Stopping) -> bool:
     missing = task.missing()
     if stopping() or not missing:
         return not missing
-    run, world = _opened(task.run, task.spec.hash(), task.houses, task.objects)
+    run, world = _opened(task.run, task.spec.hash(), task.houses, task.objects, task.robot)
     spec = arrival_specification(task.spec, task.mode == SIM)
     stored = read_scene(run, task.scene)
     scene = reconstruct_scene(world, stored.record)
@@ -206,8 +207,8 @@ def write_outcomes(path: Path, outcomes: Mapping[str, str]) -> None:
 
 
 @lru_cache(maxsize=1)
-def _opened(path: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, World]:
+def _opened(path: str, spec_hash: str, houses: str, objects: str, robot: str) -> tuple[Run, World]:
     run = Run.open(path)
     if run.manifest.spec_hash != spec_hash:
         raise InputError(path, "spec_hash", "the run now has another specification", "Start it again")
-    return run, open_world(run.manifest.spec, houses, objects)
+    return run, open_world(run.manifest.spec, houses, objects, robot)

@@ -31,6 +31,7 @@ from datagen.evaluation.methods import SEED
 from datagen.evaluation.report import RESAMPLES
 from datagen.evaluation.runs import EvaluatedRun
 from datagen.evaluation.scores import weights_for
+from datagen.replaying import places_of
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run, find_scene, open_runs
 from datagen.train.arrivals import Arrival, ring_arrival
@@ -103,8 +104,7 @@ def plan_loop(
         SceneTask(
             run.storage.url,
             run.manifest.spec,
-            given.houses or run.manifest.sources.get("houses", "builtin"),
-            given.objects or run.manifest.sources.get("objects", "builtin"),
+            *places_of(run, given),
             scene,
             mode,
             SEED,

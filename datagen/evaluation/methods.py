@@ -28,6 +28,7 @@ from datagen.train.baselines.scalars import Scalars
 from datagen.train.scorers import ModelScorer, Scorer, weights_sha256
 from datagen.train.splits import refuse_shared_houses
 from datagen.workers.extras import EXTRAS, how_to_get
+from datagen.workers.robots import ROBOTS
 
 if TYPE_CHECKING:
     from datagen.train.training.checkpoints import CheckpointHead
@@ -172,7 +173,8 @@ def baseline_methods(
         left_out["reachability"] = f"needs the robots' files. {how_to_get('sim')}"
     specs = [spec for run in runs for spec in run.specs]
     specs += [run.manifest.spec for path in fit for run in open_runs(path)]
-    robots = tuple(dict.fromkeys(spec.arm.robot for spec in specs if spec.arm is not None))
+    arms = [spec.arm for spec in specs if spec.arm is not None]
+    robots = tuple(dict.fromkeys(arm.robot_key for arm in arms if arm.robot in ROBOTS))
     made = make_baselines(names, detector, heuristic, SEED, robots)
     calibrations: dict[str, Calibration] = {}
     houses: frozenset[str] = frozenset()

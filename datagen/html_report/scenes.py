@@ -10,6 +10,7 @@ from datagen.display.figures import draw_frame, new_picture, webp_of
 from datagen.display.html_page import escape, html_picture
 from datagen.drawing.floor_plan import draw_candidates, draw_plan
 from datagen.drawing.scene_picture import Shown
+from datagen.replaying import places_of
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.run import Run
 from datagen.workers.scenes.reconstruct import reconstruct_scene
@@ -18,8 +19,8 @@ from datagen.workers.world import World, open_world
 
 def scene_sections(run: Run, scenes: list[SceneRows]) -> Iterator[str]:
     """Each scene as HTML. InputError where houses or objects cannot be opened or have changed."""
-    spec, sources = run.manifest.spec, run.manifest.sources
-    world = open_world(spec, sources.get("houses", "builtin"), sources.get("objects", "builtin"))
+    spec = run.manifest.spec
+    world = open_world(spec, *places_of(run))
     for rows in scenes:
         yield _scene(run, world, rows)
 

@@ -99,6 +99,7 @@ class JobRun:
     houses: str  # source references, absolute
     objects: str
     scenes_from: str = ""  # the run whose scenes are labelled again; "" for new scenes
+    robot: str = ""  # place of the robot's file; "" for one of the registry
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,6 +196,7 @@ class Job:
                 attempt=order.attempt,
                 houses=job_run.houses,
                 objects=job_run.objects,
+                robot=job_run.robot,
                 deadline_s=order.deadline_s,
                 notes=notes,
                 scenes_from=job_run.scenes_from,

@@ -9,7 +9,13 @@ from typing import Any, TypeVar
 from datagen.cluster.job_monitor import JOBS_API
 from datagen.cluster.ray_head import head_token
 from datagen.configuration.specify import refuse_missing_packages
-from datagen.console.command_lines import absolute_path, absolute_source, given_options, words_of
+from datagen.console.command_lines import (
+    absolute_path,
+    absolute_robot,
+    absolute_source,
+    given_options,
+    words_of,
+)
 from datagen.console.options import AS_FOUND, Sources
 from datagen.doctor.engines import probe_render_device
 from datagen.jobs.job import JobOptions, JobRun
@@ -19,7 +25,7 @@ from datagen.schemas.run import Run
 from datagen.schemas.specification import Specification
 from datagen.workers.engine_versions import refuse_other_engines
 from datagen.workers.labels import load_label_source
-from datagen.workers.robots import gripper_of
+from datagen.workers.robots import coordinates_of
 
 Options = TypeVar("Options", bound=Any)  # a dataclass of options
 
@@ -31,6 +37,9 @@ def with_absolute_paths(options: Options) -> Options:
         if (value := getattr(options, name, None)) is not None:
             make = absolute_source if name in ("houses", "objects") else absolute_path
             changed[name] = make(value)
+    robot = getattr(options, "robot", None)
+    if robot is not None:
+        changed["robot"] = absolute_robot(robot)
     return replace(options, **changed)
 
 
@@ -43,6 +52,7 @@ def words_to_resume(path: str, options: JobOptions, moved: Sources = AS_FOUND) -
     sources = {
         "--houses": moved.houses,
         "--objects": moved.objects,
+        "--robot": moved.robot,
         "--scenes-from": moved.scenes_from,
     }
     return ["resume", absolute_path(path), *words_of(sources | where)]
@@ -69,13 +79,18 @@ def open_job_run(run: Run, given: Sources, address: str) -> JobRun:
         absolute_source(given.houses or known.get("houses", "builtin")),
         absolute_source(given.objects or known.get("objects", "builtin")),
         "" if spec.scenes_from is None else absolute_path(given.scenes_from or known["scenes_from"]),
+        absolute_robot(given.robot or known.get("robot", "")),
     )
 
 
 def refuse_unusable_engines(spec: Specification, address: str) -> None:
     """Raise InputError for a robot or a renderer that does not work on this machine."""
     if spec.arm is not None:
-        gripper_of(spec.arm.robot)
+        count = coordinates_of(spec.arm.robot_key)
+        if count != (spec.arm.joints or 7):
+            problem = f"moves {count} joints here, and {spec.arm.joints or 7} in the run"
+            fix = "Start a new run, or use the version of the program that the run was made with"
+            raise InputError("--robot", spec.arm.robot, problem, fix)
     if address == "local" and spec.scenes_from is None and spec.observation.renderer == "sapien":
         device = probe_render_device()
         if not device.succeeded:

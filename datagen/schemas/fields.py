@@ -228,4 +228,5 @@ def sized_schema(name: str, spec: Specification) -> RecordSchema:
     """Return the named schema with the specification's axis lengths. InputError for an unknown name."""
     if name not in SCHEMAS:
         raise InputError("specification", "label_source", f"no record schema {name!r}", choices(SCHEMAS))
-    return SCHEMAS[name].sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter)
+    joints = {} if spec.arm is None or spec.arm.joints is None else {"joint": spec.arm.joints}
+    return SCHEMAS[name].sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter, **joints)

@@ -220,10 +220,18 @@ class ArmParams(_Frozen):
     """The arm of the label sources `plan` and `sim`; `trial` is None for `plan`."""
 
     robot: str = "panda-scaled"
+    # sha256 of all that the robot is made from; None for robots that come with ManiSkill.
+    robot_digest: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$")
+    joints: int | None = Field(default=None, ge=1, le=9)  # coordinates of the arm; None: seven
     grasps: GraspParams = GraspParams()
     motion: MotionParams = MotionParams()
     trial: TrialParams | None = None
     disturbance: DisturbanceParams | None = None
+
+    @property
+    def robot_key(self) -> str:
+        """The robot as `open_robot` accepts it, once its file has been read."""
+        return self.robot if self.robot_digest is None else f"{self.robot}@{self.robot_digest}"
 
 
 class ScenesFrom(_Frozen):

@@ -41,6 +41,14 @@ EXTRAS: dict[str, Extra] = {
         {"embreex": "embreex", "sapien": "sapien", "trimesh": "trimesh", **_PICTURES},
     ),
     "sim": Extra("plan and sim labels", {"coal": "coal", "pinocchio": "pin", "mani_skill": "mani-skill"}),
+    "robots": Extra(
+        "stretch3, tiago-pro, ur5 and pr2; meshes in COLLADA",
+        {
+            "stretch_urdf": "hello-robot-stretch-urdf",
+            "collada": "pycollada",
+            "example_robot_data": "example-robot-data",
+        },
+    ),
     "train": Extra(
         "train, evaluate, predict",
         {

@@ -20,6 +20,7 @@ from datagen.workers.objects import open_objects
 from datagen.workers.objects.convex import GRIPPER_VERSION
 from datagen.workers.objects.model import ObjectModel, ObjectSource
 from datagen.workers.rendering.embree import RayMesh, RayScene, house_rays, object_rays
+from datagen.workers.robots import remember
 
 if TYPE_CHECKING:
     from datagen.workers.grasps.targets import Targets
@@ -108,7 +109,7 @@ class World:
         from datagen.workers.robots import gripper_of
 
         assert self.spec.arm is not None
-        gripper = gripper_of(self.spec.arm.robot)
+        gripper = gripper_of(self.spec.arm.robot_key)
         return Targets(self.object_names, self.objects.load, gripper, self.spec.arm.grasps)
 
     def ray_scene(self, house: PreparedHouse, names: list[str], T_world_object: F64) -> RayScene:
@@ -129,12 +130,14 @@ def _target_names(objects: ObjectSource) -> list[str]:
     return stored["names"].tolist()
 
 
-def open_world(spec: Specification, houses: str, objects: str) -> World:
+def open_world(spec: Specification, houses: str, objects: str, robot: str = "") -> World:
     """Open the sources that `houses` and `objects` name, and check that they are the specified ones.
 
-    Raises InputError if the content of a source differs from the specification, or if it holds too few
-    houses, objects or targets.
+    `robot` is the place of the robot's file, "" for one of the registry. Raises InputError if the content of
+    a source or of a robot differs from the specification, or if it holds too few houses, objects or targets.
     """
+    if spec.arm is not None and spec.arm.robot_digest is not None:
+        remember(robot or spec.arm.robot, spec.arm.robot, spec.arm.robot_digest)
     house_source, object_source = open_houses(houses), open_objects(objects)
     for option, ref, source, wanted in (
         ("--houses", houses, house_source, spec.houses),

@@ -8,6 +8,7 @@ placement by reachability analysis" (IRC), average over the poses of a task: her
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -81,7 +82,10 @@ class Reachability:
         return {"robots": list(self.robots), "threshold": self.threshold}
 
     def _robot_of(self, reach_m: float) -> str:
-        limits = {name: robot_limits(name).reach_m for name in self.robots}
+        limits = dict[str, tuple[float, float]]()
+        for name in self.robots:
+            with suppress(InputError):  # its files are not installed here
+                limits[name] = robot_limits(name).reach_m
         for name, (low, high) in sorted(limits.items(), key=lambda item: item[1][1] - item[1][0]):
             if low - _SAME_REACH_M <= reach_m <= high + _SAME_REACH_M:
                 return name

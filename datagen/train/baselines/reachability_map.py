@@ -16,7 +16,7 @@ import numpy as np
 
 from datagen.train.inputs import F32, F64, Bools
 from datagen.workers.robots import open_robot, robot_limits
-from datagen.workers.robots.description import Gripper
+from datagen.workers.robots.gripper import Gripper
 
 # Length of the hand's last way, a straight line; the default of `motion.pregrasp_m`.
 PREGRASP_M = 0.08

@@ -82,7 +82,7 @@ def read_footprint(given: str | float | Sequence[Sequence[float]] | Footprint) -
         return given
     if not isinstance(given, str):
         return circle_footprint(given) if isinstance(given, (int, float)) else polygon_footprint(given)
-    if given in ROBOTS:
+    if given in ROBOTS or given.endswith(".toml"):
         corners_m = robot_limits(given).footprint_m
         if corners_m is None:
             problem = "stands on a pedestal: its file has no base"

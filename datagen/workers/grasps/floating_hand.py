@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import inverse, rotation_of, translation
-from datagen.workers.robots.description import Gripper, Parts
+from datagen.workers.robots.gripper import Gripper, Parts
 from datagen.workers.settling.sapien_physics import (
     add_object,
     convex_shape,
@@ -176,7 +176,8 @@ def _add_hand(
             "prismatic", [[0.0, gripper.max_opening_m / 2]], sapien_pose(T), sapien_pose(T)
         )
     hand = builder.build(fix_root_link=True)
-    for link, parts in zip(hand.links, (gripper.palm_parts_m, *gripper.finger_parts_m), strict=True):
+    parts_m = (gripper.palm_parts_m, *gripper.fingers_near(opening_m))
+    for link, parts in zip(hand.links, parts_m, strict=True):
         _attach(link, parts, rubber)
         _tune(link, test)
     for finger in hand.links[1:]:

@@ -19,12 +19,12 @@ from datagen.workers.content_cache import CacheFolder
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.grasps.search import BLOCK, VERSION, HandPoses, hand_poses_of, score_block, score_poses
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.robots.description import Gripper, Parts
+from datagen.workers.robots.gripper import Gripper, Parts
 
 
 @dataclass(frozen=True, eq=False)
 class GraspSet:
-    """G grasps, best first. The TCP frame is the gripper's (`datagen.workers.robots.description.Gripper`).
+    """G grasps, best first. The TCP frame is the gripper's (`datagen.workers.robots.gripper.Gripper`).
 
     Scores are shares of floating-hand pulls that held, 0 to 1. The scores of the first S grasps are known and
     at least `min_score`. Each other score is computed on first use and may be lower. `pose_score` gives that
@@ -190,7 +190,9 @@ def scored_grasps(model: ObjectModel, gripper: Gripper, n: int, draw: int = 0) -
 def content_digest(model: ObjectModel, gripper: Gripper, draw: int = 0) -> str:
     """sha256 over everything that decides the grasps: it seeds random numbers and names the files."""
     hand = (gripper.max_opening_m, gripper.pad_size_m, gripper.palm_depth_m)
-    other = {"draw": draw} if draw else {}
+    other: dict[str, Any] = {"draw": draw} if draw else {}
+    if gripper.linkage is not None:
+        other["linkage"] = gripper.digest
     return digest_of(
         {
             "version": VERSION,

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import coal
 import numpy as np
@@ -25,7 +26,7 @@ from datagen.workers.grasps.contacts import (
 )
 from datagen.workers.grasps.floating_hand import HandTest, held_trials
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.robots.description import Gripper
+from datagen.workers.robots.gripper import Gripper
 from datagen.workers.robots.hulls import polyhedron
 
 Bools = npt.NDArray[np.bool_]
@@ -102,6 +103,8 @@ def _free_poses(model: ObjectModel, gripper: Gripper, rng: np.random.Generator) 
             solid, points_m, cone_directions(normals, rng), gripper.max_opening_m - _LEAST_AIR_M
         )
         T, width_m = hand_poses(pairs, gripper.pad_size_m[1], rng)
+        if gripper.linkage is not None:  # fingers that turn move their pads along the approach
+            T[:, :3, 3] -= gripper.pad_depth_m(width_m)[:, None] * T[:, :3, 2]
         # Few poses around a flat object are clear of the table: these are checked first.
         clear = _is_clear(model, gripper, T, np.minimum(width_m + AIR_M[0], gripper.max_opening_m))
         rows = np.concatenate([np.flatnonzero(clear)[:_CLEAR_POSES], np.flatnonzero(~clear)[:_OTHER_POSES]])
@@ -221,24 +224,30 @@ class HandClearance:
         for part in self._object:
             self._tree.registerObject(part)
         self._tree.setup()
-        left, right = gripper.finger_parts_m
-        self._hand = [
-            (coal.CollisionObject(polyhedron(swept(part))), side)
-            # The palm first: it collides most often.
-            for parts, side in ((gripper.palm_parts_m, 0.0), (left, 0.5), (right, -0.5))
-            for part in parts
-        ]
+        self._gripper = gripper
+        self._hands: dict[int, list[tuple[Any, float]]] = {}
+
+    def _hand(self, posture: int) -> list[tuple[Any, float]]:
+        """The swept parts of the hand near a measured opening; the palm first: it collides most often."""
+        if posture not in self._hands:
+            left, right = self._gripper.fingers_in[posture]
+            self._hands[posture] = [
+                (coal.CollisionObject(polyhedron(swept(part))), side)
+                for parts, side in ((self._gripper.palm_parts_m, 0.0), (left, 0.5), (right, -0.5))
+                for part in parts
+            ]
+        return self._hands[posture]
 
     def free(self, T_object_tcp: F64, opening_m: F64 | F32) -> Bools:
         """Whether the hand, its approach included, is free of the object at each pose (N, 4, 4); (N,)."""
-        return np.array(
-            [self._is_free(T, float(o)) for T, o in zip(T_object_tcp, opening_m, strict=True)], bool
-        )
+        postures = self._gripper.posture(np.asarray(opening_m, np.float64)).tolist()
+        rows = zip(T_object_tcp, opening_m, postures, strict=True)
+        return np.array([self._is_free(T, float(o), posture) for T, o, posture in rows], bool)
 
-    def _is_free(self, T: F64, opening_m: float) -> bool:
+    def _is_free(self, T: F64, opening_m: float, posture: int) -> bool:
         R, p, y = T[:3, :3], T[:3, 3], T[:3, 1]
         callback = coal.CollisionCallBackDefault()
-        for part, side in self._hand:
+        for part, side in self._hand(posture):
             part.setRotation(R)
             part.setTranslation(p + side * opening_m * y)
             part.computeAABB()
@@ -256,10 +265,14 @@ def swept(part_m: F32) -> F32:
 def lowest_m(gripper: Gripper, T_object_tcp: F64, opening_m: F64 | F32) -> F64:
     """Lowest z (N,) of the hand in the object's frame, at the poses (N, 4, 4) and openings (N,)."""
     down = T_object_tcp[:, 2, :3]  # the object's z axis in the TCP frame
-    left, right = gripper.finger_parts_m
-    lowest = np.full(len(down), np.inf)
-    for parts, side in ((left, 0.5), (right, -0.5), (gripper.palm_parts_m, 0.0)):
-        shift = side * np.asarray(opening_m, np.float64) * down[:, 1]
-        for part in parts:
-            lowest = np.minimum(lowest, (down @ swept(part).T.astype(np.float64)).min(axis=1) + shift)
+    opening_m = np.asarray(opening_m, np.float64)
+    lowest, posture = np.full(len(down), np.inf), gripper.posture(opening_m)
+    for k in np.unique(posture):
+        rows = np.flatnonzero(posture == k)
+        left, right = gripper.fingers_in[k]
+        for parts, side in ((left, 0.5), (right, -0.5), (gripper.palm_parts_m, 0.0)):
+            shift = side * opening_m[rows] * down[rows, 1]
+            for part in parts:
+                low = (down[rows] @ swept(part).T.astype(np.float64)).min(axis=1) + shift
+                lowest[rows] = np.minimum(lowest[rows], low)
     return lowest + T_object_tcp[:, 2, 3]

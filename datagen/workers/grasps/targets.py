@@ -11,7 +11,7 @@ from datagen.schemas.specification import GraspParams
 from datagen.workers.grasps.grasp_cache import scored_grasps
 from datagen.workers.objects.convex import MAX_TARGET_MASS_KG
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.robots.description import Gripper
+from datagen.workers.robots.gripper import Gripper
 
 # Only the first grasps of an object decide whether it is a target; arms may be offered more.
 JUDGED_GRASPS = 64

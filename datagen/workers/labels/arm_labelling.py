@@ -113,7 +113,7 @@ def arm_in_scene(
     arm = arm_of(spec)
     with clock.stage("grasps"):
         reach_m, height_m = float(candidates.arm_reach_m[row]), float(candidates.base_height_m[row])
-        robot = open_robot(arm.robot, reach_m, height_m)
+        robot = open_robot(arm.robot_key, reach_m, height_m)
         grasps = grasps_of(scene.models[0], robot.gripper, arm.grasps, draw)
     base_radius_m = float(spec.candidates.radius_of_base_m(candidates.arm_reach_m[row]))
     return ArmInScene(scene, robot, grasps, arm, base_radius_m, clock, draw)

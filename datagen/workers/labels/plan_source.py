@@ -14,6 +14,7 @@ from datagen.workers.labels.arm_labelling import (
     ArmInScene,
     CandidateTrial,
     arm_in_scene,
+    arm_of,
     target_tcp,
     try_candidate,
 )
@@ -46,7 +47,7 @@ def label_with_trials(
         "grasps_tried": np.zeros(n, np.int16),
         "T_target_tcp": np.tile(np.eye(4, dtype=np.float32), (n, 1, 1)),
         "grasp_score": np.zeros(n, np.float32),
-        "q_grasp_rad": np.zeros((n, 7), np.float32),
+        "q_grasp_rad": np.zeros((n, arm_of(spec).joints or 7), np.float32),
         "path_length_rad": np.zeros(n, np.float32),
         "path_clearance_m": np.zeros(n, np.float32),
         "trials": np.zeros(n, np.int16),

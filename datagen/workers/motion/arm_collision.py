@@ -101,7 +101,7 @@ def surroundings(scene: PlanningScene, T_world_base: F64) -> Surroundings:
     near = joined(groups)
     may_touch = np.broadcast_to(floor, (len(moving.fixed), len(floor)))
     is_base_stuck = bool(hits(moving.fixed, T_base, near, 0.0, may_touch).any())
-    arm_may_touch = np.zeros((len(moving.arm), len(near)), np.bool_)
+    arm_may_touch = moving.stands[:, None] & floor
     if scene.pedestal_m is not None:
         pedestal = place([scene.pedestal_m @ T_world_base[:3, :3].T + T_world_base[:3, 3]])
         near = joined([near, pedestal])

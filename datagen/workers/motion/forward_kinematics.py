@@ -9,6 +9,7 @@ import numpy as np
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.motion.collision import Ints
+from datagen.workers.robots.kinematic_tree import KinematicTree, frame_poses
 from datagen.workers.robots.robot import Robot
 
 _MOVES = 1e-9
@@ -52,12 +53,32 @@ class ForwardKinematics:
         return _IDENTITY + a[:, None, None] * self.first[joint] + b[:, None, None] * self.second[joint]
 
 
-def forward_kinematics(robot: Robot) -> ForwardKinematics:
-    """The robot's kinematics, computed from its poses at zero and with each joint turned by 1 rad.
+@dataclass(frozen=True, eq=False)
+class TreeKinematics:
+    """As `ForwardKinematics` for joints that slide or share coordinates."""
 
-    Raises ValueError where its links are not one chain of the arm's joints.
-    """
-    count = len(robot.joint_names)
+    tree: KinematicTree
+    T_base_frame: F64  # (F, 4, 4), all coordinates at zero
+    depth: Ints  # (F,), number of joints that move the frame
+
+    def poses(self, q_rad: F64) -> F64:
+        """Poses (M, F, 4, 4) in the base frame at the coordinates (M, A)."""
+        return frame_poses(self.tree, q_rad)
+
+    def tcp(self, q_rad: F64) -> F64:
+        """Poses (M, 4, 4) of the TCP in the base frame at the coordinates (M, A)."""
+        return frame_poses(self.tree, q_rad, tcp_only=True)[:, 0]
+
+
+Kinematics = ForwardKinematics | TreeKinematics
+
+
+def forward_kinematics(robot: Robot) -> Kinematics:
+    """The robot's kinematics; of a plain arm from its poses at zero and with each joint turned by 1 rad."""
+    count, tree = len(robot.joint_names), robot.tree
+    if robot.slides.any() or count != len(tree.parent):
+        zero = frame_poses(tree, np.zeros((1, count)))[0]
+        return TreeKinematics(tree, zero, tree.frame_joint + 1)
 
     def frames(q: F64) -> F64:
         return np.concatenate([robot.T_base_link(q), robot.T_base_tcp(q)[None]])
@@ -75,7 +96,4 @@ def forward_kinematics(robot: Robot) -> ForwardKinematics:
         r = np.linalg.pinv(np.eye(3) - E[:3, :3], rcond=1e-6) @ E[:3, 3]
         first[joint, :3] = np.column_stack([K, -K @ r])
         second[joint, :3] = np.column_stack([K @ K, -K @ K @ r])
-    depth = moved.sum(axis=0)
-    if not (moved == (np.arange(count)[:, None] < depth)).all():
-        raise ValueError(f"the links of {robot.name} are not one chain of its arm's joints")
-    return ForwardKinematics(first, second, zero, depth.astype(np.int64))
+    return ForwardKinematics(first, second, zero, moved.sum(axis=0).astype(np.int64))

@@ -9,7 +9,7 @@ import numpy as np
 from datagen.schemas.specification import MotionParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.motion.collision import Bools, Hulls, Placed, hits, hulls_of
-from datagen.workers.robots.description import Gripper
+from datagen.workers.robots.gripper import Gripper
 
 # Largest error of poses by inverse kinematics: 0.5 mm, and 0.5 degrees at the palm.
 IK_SLACK_M = 0.0015
@@ -24,13 +24,16 @@ LIFT_OFF_M = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Hand:
-    """A gripper's parts: owners 0, 1 and 2 are the palm, the finger towards +y and the one towards -y."""
+    """A gripper's parts; their owners are its bodies."""
 
     hulls: Hulls
     digest: str  # the gripper's
+    gripper: Gripper
 
     def poses(self, T_tcp: F64, opening_m: F64) -> F64:
-        """Poses (M, 3, 4, 4) of the owners, in the frame of the TCP's poses (M, 4, 4); openings (M,)."""
+        """Poses (M, B, 4, 4) of the bodies, in the frame of the TCP's poses (M, 4, 4); openings (M,)."""
+        if self.gripper.linkage is not None:
+            return np.matmul(T_tcp[:, None], self.gripper.body_poses(opening_m))
         T = np.repeat(T_tcp[:, None], 3, axis=1)
         shift = T_tcp[:, :3, 1] * (opening_m / 2)[:, None]
         T[:, 1, :3, 3] += shift
@@ -44,8 +47,7 @@ _hands: dict[str, Hand] = {}
 def hand_of(gripper: Gripper) -> Hand:
     """The gripper's parts, ready for contacts; built once."""
     if gripper.digest not in _hands:
-        hulls = hulls_of([gripper.palm_parts_m, *gripper.finger_parts_m])
-        _hands[gripper.digest] = Hand(hulls, gripper.digest)
+        _hands[gripper.digest] = Hand(hulls_of(gripper.body_parts_m), gripper.digest, gripper)
     return _hands[gripper.digest]
 
 

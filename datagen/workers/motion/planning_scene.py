@@ -27,7 +27,7 @@ from datagen.workers.motion.collision import (
     place,
     place_object,
 )
-from datagen.workers.motion.forward_kinematics import ForwardKinematics, forward_kinematics
+from datagen.workers.motion.forward_kinematics import Kinematics, forward_kinematics
 from datagen.workers.motion.grasp_filter import Hand, can_be_lifted, free_grasps, hand_of
 from datagen.workers.motion.reach_table import ReachTable, reach_table
 from datagen.workers.objects.model import ObjectModel
@@ -37,7 +37,6 @@ from datagen.workers.scenes import SettledScene
 _PEDESTAL_SIDES = 16
 _PEDESTAL_GAP_M = 0.02  # between the pedestal's top and the mount
 ROOM_AROUND_M = 0.25  # how far elbows and the hand reach out beyond the TCP
-_SAME_PART_M = 1e-4
 # Penetration deeper than that of any settled object; settling allows 5 mm, by its own hulls.
 _SUNK_M = 0.01
 # Half the side of the cube of static parts, for arms that reach up to 1.25 m.
@@ -57,10 +56,11 @@ class Moving:
     its fingers as far apart as each grasp needs.
     """
 
-    kinematics: ForwardKinematics
+    kinematics: Kinematics
     fixed: Hulls  # the links that no joint moves
     arm: Hulls  # the others
     arm_depth: Ints  # (P,), number of joints that move each part of `arm`
+    stands: Bools  # (P,), parts of a base that turns on the floor
     hand: Hand
     table: ReachTable
 
@@ -250,19 +250,14 @@ def moving_of(robot: Robot, draw: int = 0) -> Moving:
         _movings.move_to_end(key)
         return _movings[key][1]
     kinematics = forward_kinematics(robot)
-    T_tcp = kinematics.T_base_frame[-1]
-    hand = robot.gripper.parts_at(robot.gripper.max_opening_m)
-    parts = [
-        () if _is_of_hand(parts, T, T_tcp, hand) else parts
-        for parts, T in zip(robot.link_parts_m, kinematics.T_base_frame, strict=False)
-    ]
-    hulls = hulls_of(parts)
+    hulls = hulls_of(robot.link_parts_m[: robot.first_hand_link])
     depth = kinematics.depth[hulls.owner]
     moving = Moving(
         kinematics,
         hulls.rows(np.flatnonzero(depth == 0)),
         hulls.rows(np.flatnonzero(depth > 0)),
         depth[depth > 0],
+        robot.is_base[hulls.owner][depth > 0],
         hand_of(robot.gripper),
         reach_table(robot, kinematics, draw),
     )
@@ -279,22 +274,6 @@ def pose_of_base(base_xy_m: F64, base_height_m: float, target_center_m: F64) -> 
     """World pose (4, 4) of the arm's mount at a base position (2,), its x axis turned to the target."""
     dx, dy = target_center_m[0] - base_xy_m[0], target_center_m[1] - base_xy_m[1]
     return yaw_pose(float(base_xy_m[0]), float(base_xy_m[1]), base_height_m, float(np.arctan2(dy, dx)))
-
-
-def _is_of_hand(parts: tuple[F32, ...], T_base_link: F64, T_base_tcp: F64, hand: tuple[F32, ...]) -> bool:
-    """Whether every part of a link is a part of the open hand, in the TCP frame with all joints at zero."""
-    R = T_base_tcp[:3, :3]
-
-    def box(points: F64) -> F64:
-        return np.concatenate([points.min(axis=0), points.max(axis=0)])
-
-    boxes = np.array([box(p.astype(np.float64)) for p in hand])
-    for part in parts:
-        in_base = part @ T_base_link[:3, :3].T + T_base_link[:3, 3]
-        apart = np.abs(boxes - box((in_base - T_base_tcp[:3, 3]) @ R)).max(axis=1)
-        if apart.min() > _SAME_PART_M:
-            return False
-    return len(parts) > 0
 
 
 def _static_around(scene: SettledScene, around_m: float) -> tuple[Placed, Bools]:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.motion.forward_kinematics import ForwardKinematics
+from datagen.workers.motion.forward_kinematics import ForwardKinematics, Kinematics, TreeKinematics
 from datagen.workers.robots.robot import Robot
 
 _SAMPLES = 65536
@@ -92,17 +92,23 @@ class ReachTable:
         return _features(wrist, T_base_tcp[:, :3, :3], self.samples.turns)
 
 
-def reach_table(robot: Robot, kinematics: ForwardKinematics, draw: int = 0) -> ReachTable:
+def reach_table(robot: Robot, kinematics: Kinematics, draw: int = 0) -> ReachTable:
     """The table of a robot; equal robots have equal tables. `draw` seeds its samples."""
     lower = np.maximum(robot.q_lower_rad, -np.pi)
     upper = np.minimum(robot.q_upper_rad, np.pi)
     T_tcp = kinematics.T_base_frame[-1]
-    wrist_m = kinematics.T_base_frame[int(np.argmax(kinematics.depth == len(lower))), :3, 3]
+    wrist_m = kinematics.T_base_frame[int(np.argmax(kinematics.depth == kinematics.depth[-1])), :3, 3]
     length_m = float(np.linalg.norm(wrist_m))
 
     def shared(T: F64) -> bytes:
         return (np.round(_with_unit(T, length_m), _DIGITS) + 0.0).tobytes()  # no negative zero
 
+    if isinstance(kinematics, TreeKinematics):
+        q = _random(lower, upper, draw)
+        poses = kinematics.tcp(q)
+        tcp_wrist_m = T_tcp[:3, :3].T @ (wrist_m - T_tcp[:3, 3])
+        poses[:, :3, 3] = (poses[:, :3, :3] @ tcp_wrist_m + poses[:, :3, 3]) / length_m
+        return ReachTable(_sampled(q, poses, robot.presents == "turns"), length_m, tcp_wrist_m, lower, upper)
     T_wrist = T_tcp.copy()
     T_wrist[:3, 3] = wrist_m
     samples = _samples(
@@ -128,12 +134,18 @@ def _samples(
     """Samples of an arm by its rounded numbers alone: the scale that is opened first does not matter."""
     P, S, T = (np.frombuffer(m).reshape(-1, 4, 4) for m in (first, second, T_wrist))
     kinematics = ForwardKinematics(P, S, T, np.array([len(P)]))
-    rng = np.random.Generator(np.random.PCG64(draw))
-    lower, upper = np.frombuffer(lower_rad), np.frombuffer(upper_rad)
-    q = rng.uniform(lower, upper, (_SAMPLES + _PROBES, len(lower)))
+    q = _random(np.frombuffer(lower_rad), np.frombuffer(upper_rad), draw)
     axis = P[0, :3, :3]  # the cross product with the first joint's axis
     is_upright = bool(abs(axis[1, 0] - 1) < 1e-6 and np.abs(P[0, :2, 3]).max() < 1e-6)
-    poses = kinematics.tcp(q)
+    return _sampled(q, kinematics.tcp(q), is_upright)
+
+
+def _random(lower: F64, upper: F64, draw: int) -> F64:
+    rng = np.random.Generator(np.random.PCG64(draw))
+    return rng.uniform(lower, upper, (_SAMPLES + _PROBES, len(lower)))
+
+
+def _sampled(q: F64, poses: F64, is_upright: bool) -> _Samples:
     features, azimuth = _features(poses[:, :3, 3], poses[:, :3, :3], is_upright)
     tree = KDTree(features[:_SAMPLES])
     gaps, _ = tree.query(features[_SAMPLES:], eps=_DISTANCE_EPS)

@@ -1,24 +1,32 @@
-"""Robots: one file of cited constants each. ROBOTS is the registry; `open_robot` opens one."""
+"""Robots: a TOML file each. ROBOTS is the registry; `open_robot` opens one of it or a file of the user's."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from datagen.schemas.errors import InputError
+from datagen.schemas.errors import InputError, choices
 from datagen.workers.registry import entry
-from datagen.workers.robots.description import RobotDescription, RobotLimits
+from datagen.workers.robots.robot_file import RobotSource, read_robot
 
 if TYPE_CHECKING:
-    from datagen.workers.robots.description import Gripper
+    from datagen.workers.robots.gripper import Gripper
     from datagen.workers.robots.robot import Robot
 
+# Names of files beside this one.
 ROBOTS: dict[str, str] = {
-    "panda-scaled": "datagen.workers.robots.panda:PANDA_SCALED",
-    "panda": "datagen.workers.robots.panda:PANDA",
-    "xarm7": "datagen.workers.robots.xarm7:XARM7",
-    "fetch": "datagen.workers.robots.fetch:FETCH",
+    "panda-scaled": "panda_scaled.toml",
+    "panda": "panda.toml",
+    "xarm7": "xarm7.toml",
+    "fetch": "fetch.toml",
+    "stretch3": "stretch3.toml",
+    "tiago-pro": "tiago_pro.toml",
+    "ur5": "ur5.toml",
+    "pr2": "pr2.toml",
 }
 
 # Reaches and heights are stated in whole millimetres.
@@ -26,59 +34,150 @@ _STEP_M = 0.001
 _HIGHEST_MOUNT_M = 100.0
 
 
+@dataclass(frozen=True)
+class RobotLimits:
+    """Ranges that a robot supports. A range whose ends are equal is a single value."""
+
+    reach_m: tuple[float, float]
+    base_height_m: tuple[float, float] | None  # None: a pedestal of any height
+    base_radius_m: float | None  # its own mobile base; None stands on a pedestal
+    # Corners (x, y) of its base's outline in the base frame: origin below the mount, x to the front.
+    footprint_m: tuple[tuple[float, float], ...] | None = None
+
+
 def robot_limits(name: str) -> RobotLimits:
-    """The ranges of a robot, from constants only. Raises InputError for an unknown name."""
-    return _description(name).limits
+    """The ranges of a robot. Raises InputError as `open_robot` does.
+
+    They need no URDF where the file states the reach, and the height and outline of a base.
+    """
+    source = robot_source(name)
+    keys, base = source.keys, source.keys.base
+    if keys.scaled is not None:
+        return RobotLimits(keys.scaled.reach_m, None, None)
+    reach_m = (keys.reach_m or 0.0, keys.reach_m or 0.0)
+    if base.pedestal and keys.reach_m is not None:
+        return RobotLimits(reach_m, None, None)
+    if (
+        keys.reach_m is not None
+        and base.height_m is not None
+        and (radius_m := base.outer_radius_m) is not None
+    ):
+        return RobotLimits(reach_m, (base.height_m, base.height_m), radius_m, base.footprint_m)
+    return _limits(source)
+
+
+@lru_cache(maxsize=64)
+def _limits(source: RobotSource) -> RobotLimits:
+    robot = _built(source, None)
+    reach_m, base = source.keys.reach_m or math.ceil(1000 * robot.reach_m) / 1000, robot.base
+    height_m = None if base.height_m is None else (base.height_m, base.height_m)
+    return RobotLimits((reach_m, reach_m), height_m, base.radius_m, base.footprint_m)
 
 
 def open_robot(name: str, reach_m: float | None, base_height_m: float) -> Robot:
-    """A robot of the registry at one mount height; the last 64 are kept.
+    """A robot at one mount height, by its name in the registry or the path of its file.
 
-    `reach_m` None is the robot's own reach; `panda-scaled` has none. Raises InputError naming
-    `--robot` for an unknown name, a reach or a height outside the robot's range, and naming the file
-    for a URDF or a mesh that cannot be used.
+    `reach_m` None is the robot's own reach; one that is scaled has none. Raises InputError naming `--robot`
+    for an unknown name, a reach or a height outside the robot's range, and naming the file for a key, a URDF
+    or a mesh that cannot be used.
     """
-    description = _description(name)
-    own = description.extension is None
-    low, high = description.limits.reach_m
+    source, limits = robot_source(name), robot_limits(name)
+    own = source.keys.scaled is None
+    low, high = limits.reach_m
     problem = "is scaled to a reach, but none is given" if reach_m is None and not own else ""
     if reach_m is not None and not low - _STEP_M <= reach_m <= high + _STEP_M:
         problem = f"a reach of {reach_m} m is outside its range"
     if problem:
         raise InputError("--robot", name, problem, _within("reach", low, high))
-    bottom, top = description.limits.base_height_m or (0.0, math.inf)
+    bottom, top = limits.base_height_m or (0.0, math.inf)
     # Stored heights are float32, which may lie just outside.
     if not bottom - _STEP_M <= base_height_m <= min(top + _STEP_M, _HIGHEST_MOUNT_M):
         fix = _within("base height", bottom, top)
         raise InputError("--robot", name, f"a base height of {base_height_m} m is outside its range", fix)
-    return _mounted(name, None if own else reach_m, min(max(base_height_m, bottom), top))
+    return _mounted(source, None if own else reach_m, min(max(base_height_m, bottom), top))
 
 
 def gripper_of(name: str) -> Gripper:
     """The gripper of a robot, which is the same at every reach and height."""
+    return _any_of(name).gripper
+
+
+def coordinates_of(name: str) -> int:
+    """Number of coordinates that move a robot's arm."""
+    return len(_any_of(name).joint_names)
+
+
+def _any_of(name: str) -> Robot:
     limits = robot_limits(name)
     height_m = limits.base_height_m[0] if limits.base_height_m else 0.0
-    return open_robot(name, limits.reach_m[1], height_m).gripper
+    return open_robot(name, limits.reach_m[1], height_m)
 
 
-def _description(name: str) -> RobotDescription:
-    return entry(ROBOTS, name, "--robot")
+def robot_source(name: str) -> RobotSource:
+    """The file of a robot: of the registry, or at a path that ends with .toml, or that this process has read.
+
+    The last are named `name@digest`, as a specification does. Raises InputError for an unknown one.
+    """
+    if name in ROBOTS:
+        return read_robot(Path(__file__).parent / ROBOTS[name])
+    if name.endswith(".toml"):
+        return read_robot(Path(name))
+    if name in _read:
+        return _read[name]
+    plain, _, digest = name.rpartition("@")
+    if plain and len(digest) == 64:
+        if plain in ROBOTS:
+            return remember(plain, plain, digest)
+        fix = "Give --robot with the robot's file"
+        raise InputError("--robot", plain, "is a robot from a file that was not named", fix)
+    raise InputError(
+        "--robot", name or "''", "is unknown", f"{choices(ROBOTS, name)}, or give a file: ROBOT.toml"
+    )
+
+
+_read: dict[str, RobotSource] = {}
+
+
+def robot_digest(name: str) -> str | None:
+    """sha256 of all that a robot is made from; None where ManiSkill brings its files, by their version."""
+    source = robot_source(name)
+    if name in ROBOTS and source.keys.urdf.startswith("package:mani_skill/"):
+        return None
+    return _digest(source)
+
+
+def remember(place: str, name: str, digest: str) -> RobotSource:
+    """Read the robot at a place, under the name and digest of a specification. InputError for another one."""
+    source = robot_source(place)
+    found = _digest(source)
+    if found != digest or source.name != name:
+        problem = f"holds {source.name} {found[:12]}, but the run was made with {name} {digest[:12]}"
+        fix = "Give the file that the run was started with, or start a new run"
+        raise InputError("--robot", place, problem, fix)
+    _read[f"{name}@{digest}"] = source
+    return source
 
 
 @lru_cache(maxsize=64)
-def _mounted(name: str, reach_m: float | None, base_height_m: float) -> Robot:
-    if _description(name).lift is not None:
-        return _built(name, reach_m, base_height_m)
+def _digest(source: RobotSource) -> str:
+    return _code("assembly:content_digest")(source)
+
+
+@lru_cache(maxsize=64)
+def _mounted(source: RobotSource, reach_m: float | None, base_height_m: float) -> Robot:
     # Pedestals of any height carry the same arm.
-    return _built(name, reach_m, 0.0).at_height(base_height_m)
+    return _built(source, reach_m).at_height(base_height_m)
 
 
 # A scaled arm has fewer reaches in whole centimetres.
 @lru_cache(maxsize=128)
-def _built(name: str, reach_m: float | None, base_height_m: float) -> Robot:
-    # Imported on first use, so that limits can be read without a simulator.
-    build = entry({name: "datagen.workers.robots.robot:Robot"}, name, "--robot")
-    return build(_description(name), reach_m, base_height_m)
+def _built(source: RobotSource, reach_m: float | None) -> Robot:
+    return _code("robot:Robot")(source, reach_m)
+
+
+def _code(name: str) -> Callable[..., Any]:
+    # Imported on first use, so that names can be read without a simulator.
+    return entry({"robots": f"datagen.workers.robots.{name}"}, "robots", "--robot")
 
 
 def _within(what: str, low: float, high: float) -> str:

@@ -1,346 +1,387 @@
-"""Assembly of a robot: the URDF's links from the mount to the flange, scaled, with the hand on it."""
+"""Assembly of a robot: the URDF's links from the base to the tip, scaled, with the hand on it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from pathlib import Path
+from hashlib import sha256
 
 import numpy as np
 
-from datagen.schemas.errors import InputError
+from datagen.schemas.identity import digest_of
+from datagen.schemas.safe_files import read_regular
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.geometry.transforms import translation
-from datagen.workers.robots.description import HandDescription, Parts, RobotDescription, robots_folder
-from datagen.workers.robots.hulls import shape_parts
-from datagen.workers.robots.urdf import Inertial, Joint, Link, Shape, UrdfTree, read_urdf, scaled_inertial
+from datagen.workers.geometry.transforms import inverse, translation
+from datagen.workers.robots.base import Base, base_of
+from datagen.workers.robots.hand import Hand, hand_of
+from datagen.workers.robots.kinematic_tree import Bools, Ints, KinematicTree
+from datagen.workers.robots.links import (
+    LinkBody,
+    body_of,
+    cluster_of,
+    motion,
+    scaled_pose,
+    without_shapes,
+    wrong_urdf,
+)
+from datagen.workers.robots.reach import Chain, farthest_m, largest_reach_m
+from datagen.workers.robots.resources import resource
+from datagen.workers.robots.robot_file import RobotSource, ScaleKeys
+from datagen.workers.robots.urdf import FIX, Joint, UrdfTree, read_urdf, rpy_rotation
 
 _TUBE_SIDES = 12
 _REACH_TOLERANCE_M = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class LinkBody:
-    """A link with a shape, together with all links that are fixed to it."""
-
-    name: str
-    inertial: Inertial | None
-    parts_m: Parts  # link frame
-    visuals: tuple[Shape, ...]  # visual meshes, link frame, unscaled
-    scale: float
-    drawn_m: Parts  # parts to draw where there are no visuals
+_MOST_BYTES = 64 << 20
+FEWEST, MOST = 4, 9  # coordinates
+# Speeds of joints for which the URDF has none.
+_SPEED_RADPS, _SPEED_MPS = 1.0, 0.2
+TURN = "base_turn"  # the joint of a base that turns in place
 
 
 @dataclass(frozen=True, eq=False)
 class Assembly:
-    """Bodies 0 (root), 1..A (arm), then palm and two fingers. Joint k moves body k + 1."""
+    """Bodies 0 (root), 1..J (arm), then the palm and the fingers. Joint k moves body k + 1.
+
+    Joint j stands at `ratio[j] * q[coordinate[j]] + offset[j]`; A coordinates.
+    """
 
     bodies: tuple[LinkBody, ...]
-    arm: tuple[Joint, ...]  # (A,), with scaled origins; names of parent and child are those of bodies
+    arm: tuple[Joint, ...]  # (J,), with scaled origins; names of parent and child are those of bodies
     palm: Joint
-    fingers: tuple[Joint, Joint]
+    hand: Hand
+    base: Base
     T_root_mount: F64  # (4, 4)
-    T_palm_tcp: F64
+    names: tuple[str, ...]  # (A,) of the coordinates
+    coordinate: Ints  # (J,)
+    ratio: F64  # (J,)
+    offset: F64  # (J,)
+    lower: F64  # (A,)
+    upper: F64  # (A,)
+    speed: F64  # (A,), radians or metres a second
+    slides: Bools  # (A,)
+    shoulder_m: F64  # (3,), base frame: where the reach is measured from
     reach_m: float
-    wrist_reach_m: float  # largest distance of the last joint from the first
+    wrist_reach_m: float  # largest distance of the last joint from there
     scale: float
 
+    @property
+    def hand_placements(self) -> list[F64]:
+        """Poses (4, 4) of the hand's bodies in the frame of the last joint, fully open."""
+        T = [self.palm.T_parent_child]
+        names = [self.palm.child]
+        for joint, position in zip(self.hand.joints, self.hand.open, strict=True):
+            names.append(joint.child)
+            T.append(T[names.index(joint.parent)] @ joint.T_parent_child @ motion(joint, position))
+        return T
 
-def assemble(description: RobotDescription, reach_m: float | None, lift_m: float) -> Assembly:
-    """Read the URDFs and assemble the robot.
+    def tree(self) -> KinematicTree:
+        """All joints, and a frame for every body, fingers open, and for the TCP."""
+        J = len(self.arm)
+        T_base_root = inverse(self.T_root_mount)
+        joints = [joint.T_parent_child for joint in self.arm]
+        hand = self.hand_placements
+        return KinematicTree(
+            np.arange(J) - 1,
+            np.stack([T_base_root @ joints[0], *joints[1:]]),
+            np.stack([joint.axis for joint in self.arm]),
+            np.array([joint.kind == "prismatic" for joint in self.arm]),
+            self.coordinate,
+            self.ratio,
+            self.offset,
+            self.lower,
+            self.upper,
+            np.array([-1, *range(J), *[J - 1] * (len(hand) + 1)]),
+            np.stack([T_base_root, *[np.eye(4)] * J, *hand, hand[0] @ self.hand.T_palm_tcp]),
+        )
 
-    `reach_m` is for a robot that is scaled to its reach; `lift_m` for one with a torso. Raises InputError
-    naming the file and what is wrong in it.
+
+def read_trees(source: RobotSource) -> tuple[UrdfTree, UrdfTree]:
+    """The URDFs of arm and hand, without the shapes to ignore. InputError naming the file and its fault."""
+    keys, folder = source.keys, source.path.parent
+    tree = read_urdf(resource(keys.urdf, folder, source.path, "urdf"))
+    hand = tree
+    if keys.hand.urdf is not None:
+        hand = read_urdf(resource(keys.hand.urdf, folder, source.path, "hand.urdf"))
+    for name in keys.arm.ignore:
+        if name not in tree.links and name not in hand.links:
+            raise source.wrong("arm.ignore", f"link {name} is not in the URDF")
+    bare = [without_shapes(t, [name for name in keys.arm.ignore if name in t.links]) for t in (tree, hand)]
+    return bare[0], bare[0] if hand is tree else bare[1]
+
+
+def content_digest(source: RobotSource) -> str:
+    """sha256 of all that a robot is made from: its keys, URDFs and collision meshes, wherever they lie."""
+    keys = source.keys.model_dump(mode="json")
+    keys.pop("about")
+    keys["urdf"] = keys["hand"]["urdf"] = None
+    contents: list[str] = []
+    trees = read_trees(source)
+    for tree in trees if trees[0] is not trees[1] else trees[:1]:
+        contents.append(sha256(read_regular(tree.path, _MOST_BYTES, FIX)).hexdigest())
+        for link in tree.links.values():
+            for shape in link.collisions:
+                if shape.mesh is not None and shape.mesh.is_file():
+                    contents.append(sha256(read_regular(shape.mesh, _MOST_BYTES, FIX)).hexdigest())
+    return digest_of({"keys": keys, "contents": contents})
+
+
+def assemble(source: RobotSource, reach_m: float | None) -> Assembly:
+    """Read the URDFs and assemble the robot; `reach_m` is for a robot that is scaled to its reach.
+
+    Raises InputError naming the file and what is wrong in it.
     """
-    tree = read_urdf(robots_folder() / description.urdf)
-    same = description.hand.urdf == description.urdf
-    hand = tree if same else read_urdf(robots_folder() / description.hand.urdf)
-    held = dict(description.held)
-    if description.lift:
-        held[description.lift.joint] = lift_m
-    heads = (description.root_link, *(tree.joint(name).child for name in description.arm_joints))
-    hand_mount = tree.joint_above(description.hand.palm_link)
-    stops = {*description.arm_joints, *([hand_mount.name] if hand_mount else [])}
-    for name in description.shapeless:
-        tree.links[name] = replace(tree.link(name), collisions=(), visuals=())
-    clusters = [_cluster(tree, head, stops, held) for head in heads]
-    scale, extension_m = 1.0, 0.0
-    if description.extension is not None and reach_m is not None:
-        rule = description.extension
-        share = (rule.none_from_reach_m - reach_m) / (rule.none_from_reach_m - description.limits.reach_m[0])
-        extension_m = rule.longest_m * min(max(share, 0.0), 1.0)
-        scale = _scale_for(description, tree, clusters, extension_m, reach_m)
-    arm, palm, chain = _joints(description, tree, clusters, scale, extension_m)
-    unscaled = _joints(description, tree, clusters, 1.0, 0.0)[2]
-    links = [
-        _body(tree.path, head, cluster, scale, description.cuts_m)
-        for head, cluster in zip(heads, clusters, strict=True)
+    keys = source.keys
+    tree, hand_tree = read_trees(source)
+    palm = keys.hand.palm or keys.arm.tip
+    if keys.hand.urdf is not None and keys.hand.palm is None:
+        raise source.wrong("hand.palm", "is missing", "Name the link of the hand's URDF that is mounted")
+    hand = hand_of(source, hand_tree, palm)
+    arm = _ArmChain(source, tree, palm)
+    scale, tube_m = 1.0, 0.0
+    if keys.scaled is not None and reach_m is not None:
+        rule = keys.scaled
+        share = (rule.no_tube_from_m - reach_m) / (rule.no_tube_from_m - rule.reach_m[0])
+        tube_m = rule.tube_m * min(max(share, 0.0), 1.0)
+        scale = arm.scale_for(hand, tube_m, reach_m)
+    joints, T_palm = arm.joints(scale), arm.palm(scale, tube_m)
+    cuts = keys.arm.cuts_m
+    bodies = [
+        body_of(name, cluster, scale, cuts) for name, cluster in zip(arm.names, arm.clusters, strict=True)
     ]
-    if extension_m > 0.0:
-        assert description.extension is not None
-        T_flange = _scaled_pose(clusters[-1][description.flange_link][1], scale)
-        tube = _tube(T_flange, extension_m, description.extension.radius_m)
-        last = links[-1]
-        links[-1] = replace(
-            last,
-            parts_m=(*last.parts_m, tube),
-            drawn_m=(*last.drawn_m, tube),
+    k = int(arm.turns)
+    base = base_of(source, bodies[k], joints, arm.turns)
+    if base.deck_m is not None:
+        bodies[k] = replace(
+            bodies[k], parts_m=(*bodies[k].parts_m, base.deck_m), drawn_m=(*bodies[k].drawn_m, base.deck_m)
         )
-    fingers = _fingers(hand, description.hand)
-    names = (description.hand.palm_link, *(joint.child for joint in fingers))
-    links += [_body(hand.path, name, {name: (hand.link(name), np.eye(4))}, 1.0, {}) for name in names]
-    mount = tree.joint(description.arm_joints[0])
-    T_root_mount = np.eye(4)
-    if description.lift:
-        # With a torso the mount is the origin of the first joint; elsewhere it is the root link.
-        T_root_mount[:3, 3] = (clusters[0][mount.parent][1] @ mount.T_parent_child)[:3, 3]
-    return Assembly(
-        tuple(links),
-        arm,
-        palm,
-        fingers,
-        T_root_mount,
-        description.hand.T_palm_tcp,
-        largest_reach_m(chain),
-        scale * largest_reach_m(replace(unscaled, tcp_m=np.zeros(3))),
-        scale,
+    if tube_m > 0.0 and keys.scaled is not None:
+        tube = _tube(scaled_pose(arm.T_tip, scale), tube_m, keys.scaled)
+        last = bodies[-1]
+        bodies[-1] = replace(last, parts_m=(*last.parts_m, tube), drawn_m=(*last.drawn_m, tube))
+    no_axis = np.array([0.0, 0.0, 1.0])
+    mount = Joint(
+        "hand_mount", "fixed", arm.names[-1], hand.bodies[0].name, T_palm, no_axis, 0.0, 0.0, 0.0, 0.0
     )
-
-
-_Cluster = dict[str, tuple[Link, F64]]  # links that are fixed to the head, with their poses in its frame
-
-
-def _cluster(tree: UrdfTree, head: str, stops: set[str], held: dict[str, float]) -> _Cluster:
-    found: _Cluster = {head: (tree.link(head), np.eye(4))}
-    waiting = [head]
-    while waiting:
-        parent = waiting.pop()
-        for joint in tree.children(parent):
-            if joint.name in stops:
-                continue
-            if joint.kind != "fixed" and joint.name not in held:
-                fix = "Name it in the robot's file, or use the URDF that ManiSkill brings"
-                raise InputError(tree.path, f"joint {joint.name}", "has no fixed position", fix)
-            T = found[parent][1] @ joint.T_parent_child
-            if joint.kind == "prismatic":
-                T = T @ translation(*(joint.axis * held[joint.name]))
-            found[joint.child] = (tree.link(joint.child), T)
-            waiting.append(joint.child)
-    return found
-
-
-def _joints(
-    description: RobotDescription, tree: UrdfTree, clusters: list[_Cluster], scale: float, extension_m: float
-) -> tuple[tuple[Joint, ...], Joint, Chain]:
-    heads = [next(iter(cluster)) for cluster in clusters]
-    arm: list[Joint] = []
-    for k, name in enumerate(description.arm_joints):
-        joint = tree.joint(name)
-        if joint.kind not in ("revolute", "continuous"):
-            raise _wrong(tree.path, f"joint {name}", f"is {joint.kind}; joints of an arm turn")
-        if joint.parent not in clusters[k]:
-            raise _wrong(tree.path, f"joint {name}", f"does not follow {heads[k]}")
-        T = _scaled_pose(clusters[k][joint.parent][1] @ joint.T_parent_child, scale)
-        # Half a turn each way reaches every pose of a joint that turns freely.
-        lower, upper = max(joint.lower, -2 * np.pi), min(joint.upper, 2 * np.pi)
-        if joint.kind == "continuous":
-            lower, upper = -np.pi, np.pi
-        arm.append(
-            replace(joint, kind="revolute", parent=heads[k], T_parent_child=T, lower=lower, upper=upper)
-        )
-    if description.flange_link not in clusters[-1]:
-        raise _wrong(tree.path, f"link {description.flange_link}", f"is not fixed to {heads[-1]}")
-    T_flange = _scaled_pose(clusters[-1][description.flange_link][1], scale)
-    T_palm = T_flange @ translation(0.0, 0.0, extension_m) @ description.T_flange_palm
-    palm = Joint(
-        "hand_mount", "fixed", heads[-1], description.hand.palm_link, T_palm, np.array([0.0, 0.0, 1.0]),
-        0.0, 0.0, 0.0, 0.0,
+    found = Assembly(
+        (*bodies, *hand.bodies), joints, mount, hand, base, base.T_root_mount, arm.coordinates,
+        arm.coordinate, arm.ratio, arm.offset, arm.lower, arm.upper, arm.speed, arm.slides,
+        np.zeros(3), 0.0, 0.0, scale,
     )  # fmt: skip
-    chain = Chain(
-        np.stack([joint.T_parent_child for joint in arm]),
-        np.stack([joint.axis for joint in arm]),
-        np.array([joint.lower for joint in arm]),
-        np.array([joint.upper for joint in arm]),
-        (T_palm @ description.hand.T_palm_tcp)[:3, 3],
-    )
-    return tuple(arm), palm, chain
+    return _with_reach(source, found, arm, hand)
 
 
-def _scale_for(
-    description: RobotDescription,
-    tree: UrdfTree,
-    clusters: list[_Cluster],
-    extension_m: float,
-    reach_m: float,
-) -> float:
-    """The scale at which the arm reaches `reach_m`, by the secant method: reach is nearly linear in it."""
-
-    def reach_at(scale: float) -> float:
-        return largest_reach_m(_joints(description, tree, clusters, scale, extension_m)[2])
-
-    low, high = 0.1, 1.0
-    at_low, at_high = reach_at(low), reach_at(high)
-    for _ in range(20):
-        if at_high == at_low:
-            break
-        guess = low + (reach_m - at_low) * (high - low) / (at_high - at_low)
-        at_guess = reach_at(guess)
-        if abs(at_guess - reach_m) < _REACH_TOLERANCE_M:
-            return guess
-        low, at_low, high, at_high = high, at_high, guess, at_guess
-    raise _wrong(tree.path, "joints", f"no scale gives a reach of {reach_m} m")
-
-
-def _body(
-    path: Path, name: str, cluster: _Cluster, scale: float, cuts_m: Mapping[str, tuple[float, ...]]
-) -> LinkBody:
-    parts: list[F32] = []
-    visuals: list[Shape] = []
-    for link, T in cluster.values():
-        for shape in link.collisions:
-            parts += shape_parts(_placed(shape, T), scale, cuts_m.get(link.name, ()))
-        visuals += (_placed(shape, T) for shape in link.visuals)
-    if not parts:
-        raise _wrong(path, f"link {name}", "has no collision shape")
-    inertial = _combined([(link.inertial, T) for link, T in cluster.values() if link.inertial])
-    if inertial is not None:
-        inertial = scaled_inertial(inertial, scale)
-    # Visual meshes are read from glTF alone; hulls replace those of other formats.
-    if any(shape.mesh is None or shape.mesh.suffix != ".glb" for shape in visuals):
-        visuals = []
-    drawn = () if visuals else tuple(parts)
-    return LinkBody(name, inertial, tuple(parts), tuple(visuals), scale, drawn)
+def _with_reach(source: RobotSource, found: Assembly, arm: _ArmChain, hand: Hand) -> Assembly:
+    """With the shoulder and the largest distances from it."""
+    T_base_root, plain = inverse(found.T_root_mount), not found.slides.any() and not arm.turns
+    if plain and len(found.names) == len(found.arm):
+        chain = arm.chain(found.arm, found.palm.T_parent_child, hand)
+        shoulder_m = (T_base_root @ found.arm[0].T_parent_child)[:3, 3]
+        unscaled = arm.chain(arm.joints(1.0), arm.palm(1.0, 0.0), hand)
+        reach_m = largest_reach_m(chain)
+        wrist_m = found.scale * largest_reach_m(replace(unscaled, tcp_m=np.zeros(3)))
+    else:
+        # Lifts that come first stand in the middle of their range.
+        tree = found.tree()
+        T, shoulder_m = np.eye(4), np.zeros(3)
+        for j, joint in enumerate(found.arm):
+            T = T @ tree.T_parent_joint[j]
+            if joint.kind == "prismatic":
+                k = found.coordinate[j]
+                position = float(found.ratio[j] * (found.lower[k] + found.upper[k]) / 2 + found.offset[j])
+                T = T @ motion(joint, position)
+                shoulder_m = T[:3, 3]
+            elif joint.name != TURN:
+                shoulder_m = T[:3, 3]
+                break
+        if arm.turns:
+            shoulder_m = np.array([0.0, 0.0, shoulder_m[2]])
+        reach_m = farthest_m(tree, np.zeros(3), shoulder_m)
+        T_last_tcp = found.palm.T_parent_child @ hand.T_palm_tcp
+        wrist_m = farthest_m(tree, inverse(T_last_tcp)[:3, 3], shoulder_m)
+    given = source.keys.reach_m
+    if given is not None and abs(given - reach_m) > 0.01:
+        raise source.wrong(
+            "reach_m", f"is {given:g} m, and the URDF's arm has {reach_m:.3f} m", "Correct or omit it"
+        )
+    return replace(found, shoulder_m=shoulder_m, reach_m=reach_m, wrist_reach_m=wrist_m)
 
 
-def _placed(shape: Shape, T: F64) -> Shape:
-    return replace(shape, T_link_shape=T @ shape.T_link_shape)
+class _ArmChain:
+    """The joints between base and tip, and the links that are fixed to each of them."""
+
+    def __init__(self, source: RobotSource, tree: UrdfTree, palm: str) -> None:
+        keys = source.keys
+        self.tree, self.keys, self.turns = tree, keys, keys.base.presents == "turns"
+        chain = tree.chain(keys.arm.base, keys.arm.tip)
+        for name in (*keys.arm.held, *(name for group in keys.arm.coupled for name in group)):
+            tree.joint(name)
+        self._joints = [j for j in chain if j.kind != "fixed" and tree.driver(j)[0].name not in keys.arm.held]
+        if not self._joints:
+            raise source.wrong(
+                "arm.tip", f"no joint moves between {keys.arm.base} and {keys.arm.tip}", "Correct it"
+            )
+        above = tree.joint_above(palm) if keys.hand.urdf is None and palm != keys.arm.tip else None
+        stops = {*(joint.name for joint in self._joints), *([above.name] if above else [])}
+        heads = [keys.arm.base, *(joint.child for joint in self._joints)]
+        x, y = keys.base.mount_m or (0.0, 0.0)
+        T_heads: list[F64 | None] = [
+            translation(-x, -y, 0.0) if self.turns else None,
+            *[None] * len(self._joints),
+        ]
+        self.clusters = [
+            cluster_of(tree, head, stops, keys.arm.held, T) for head, T in zip(heads, T_heads, strict=True)
+        ]
+        self.names = heads
+        if palm in self.clusters[-1] and keys.hand.urdf is None:
+            # The hand begins at the last joint: its bodies hold those links.
+            bare = self.clusters[-1][keys.arm.tip][0]
+            self.clusters[-1] = {
+                keys.arm.tip: (
+                    replace(bare, collisions=(), visuals=(), inertial=None),
+                    self.clusters[-1][keys.arm.tip][1],
+                )
+            }
+            self.names = [*heads[:-1], f"{heads[-1]}-tip"] if heads[-1] == palm else heads
+        self.T_tip = self.clusters[-1][keys.arm.tip][1]
+        self.T_tip_palm = self._tip_palm(source, palm)
+        self._coordinates(source)
+
+    def _tip_palm(self, source: RobotSource, palm: str) -> F64:
+        mount, T = self.keys.hand.mount, np.eye(4)
+        if mount is not None:
+            T[:3, 3] = mount.xyz_m
+            T[:3, :3] = rpy_rotation(np.array(mount.rpy_rad)) + 0.0  # no negative zero
+            return T
+        if self.keys.hand.urdf is None:
+            for joint in self.tree.chain(self.keys.arm.tip, palm):
+                if joint.kind != "fixed":
+                    problem = f"joint {joint.name} moves between arm.tip and hand.palm"
+                    raise source.wrong("hand.palm", problem, "Name a tip below it")
+                T = T @ joint.T_parent_child
+        return T
+
+    def _coordinates(self, source: RobotSource) -> None:
+        """Coordinates of the joints: shared by coupled and by mimic ones."""
+        tree, coupled = self.tree, self.keys.arm.coupled
+        rows: dict[str, int] = {TURN: 0} if self.turns else {}
+        low, high = map(np.radians, self.keys.base.range_deg)
+        limits = [(float(low), float(high))] if self.turns else []
+        slides, speeds = ([False], [_SPEED_RADPS]) if self.turns else ([], [])
+        columns = [(0, 1.0, 0.0)] if self.turns else []
+        for joint in self._joints:
+            driver, ratio, offset = tree.driver(joint)
+            group = next((g for g in coupled if driver.name in g), (driver.name,))
+            ratio /= len(group)
+            name = group[0] if len(group) == 1 else "+".join(group)
+            bounds = np.array(tree.limits(driver)) * len(group)
+            if name not in rows:
+                rows[name] = len(limits)
+                limits.append((float(bounds[0]), float(bounds[1])))
+                slides.append(driver.kind == "prismatic")
+                known = 0 < driver.speed < np.inf
+                speeds.append(
+                    driver.speed * len(group) if known else _SPEED_MPS if slides[-1] else _SPEED_RADPS
+                )
+            k = rows[name]
+            limits[k] = max(limits[k][0], float(bounds[0])), min(limits[k][1], float(bounds[1]))
+            if (driver.kind == "prismatic") != slides[k]:
+                raise source.wrong(
+                    "arm.coupled", f"{driver.name} does not slide as the others do", "Correct the group"
+                )
+            columns.append((k, ratio, offset))
+        if not FEWEST <= len(rows) <= MOST:
+            fix = (
+                "Hold joints in arm.held, or couple them in arm.coupled"
+                if len(rows) > MOST
+                else "Correct arm.base or arm.tip"
+            )
+            raise source.wrong(
+                "arm", f"{len(rows)} joints move: {', '.join(rows)}; {FEWEST} to {MOST} may", fix
+            )
+        self.coordinates = tuple(rows)
+        self.coordinate = np.array([k for k, _, _ in columns])
+        self.ratio, self.offset = (np.array([column[n] for column in columns]) for n in (1, 2))
+        self.lower, self.upper = np.array(limits).T.copy()
+        self.speed, self.slides = np.array(speeds), np.array(slides)
+        if self.turns:
+            self.names = ["base_mount", *self.names]
+            self.clusters = [{}, *self.clusters]
+
+    def joints(self, scale: float) -> tuple[Joint, ...]:
+        """The joints (J,) with scaled origins."""
+        found: list[Joint] = []
+        if self.turns:
+            x, y = self.keys.base.mount_m or (0.0, 0.0)
+            up = np.array([0.0, 0.0, 1.0])
+            low, high = map(np.radians, self.keys.base.range_deg)
+            found.append(
+                Joint(
+                    TURN,
+                    "revolute",
+                    self.names[0],
+                    self.names[1],
+                    translation(x, y, 0.0),
+                    up,
+                    low,
+                    high,
+                    1.0,
+                    1e3,
+                )
+            )
+        for joint in self._joints:
+            k = len(found)
+            T = scaled_pose(self.clusters[k][joint.parent][1] @ joint.T_parent_child, scale)
+            lower, upper = self.tree.limits(self.tree.driver(joint)[0])
+            kind = "prismatic" if joint.kind == "prismatic" else "revolute"
+            child = self.names[k + 1]
+            found.append(
+                replace(
+                    joint,
+                    kind=kind,
+                    parent=self.names[k],
+                    child=child,
+                    T_parent_child=T,
+                    lower=lower,
+                    upper=upper,
+                )
+            )
+        return tuple(found)
+
+    def palm(self, scale: float, tube_m: float) -> F64:
+        """Pose (4, 4) of the palm in the frame of the last joint."""
+        return scaled_pose(self.T_tip, scale) @ translation(0.0, 0.0, tube_m) @ self.T_tip_palm
+
+    def chain(self, joints: tuple[Joint, ...], T_palm: F64, hand: Hand) -> Chain:
+        """The joints, all of which turn, up to the TCP."""
+        return Chain(
+            np.stack([joint.T_parent_child for joint in joints]),
+            np.stack([joint.axis for joint in joints]),
+            self.lower,
+            self.upper,
+            (T_palm @ hand.T_palm_tcp)[:3, 3],
+        )
+
+    def scale_for(self, hand: Hand, tube_m: float, reach_m: float) -> float:
+        """The scale at which the arm reaches `reach_m` by the secant method: it is nearly linear in it."""
+
+        def reach_at(scale: float) -> float:
+            return largest_reach_m(self.chain(self.joints(scale), self.palm(scale, tube_m), hand))
+
+        low, high = 0.1, 1.0
+        at_low, at_high = reach_at(low), reach_at(high)
+        for _ in range(20):
+            if at_high == at_low:
+                break
+            guess = low + (reach_m - at_low) * (high - low) / (at_high - at_low)
+            at_guess = reach_at(guess)
+            if abs(at_guess - reach_m) < _REACH_TOLERANCE_M:
+                return guess
+            low, at_low, high, at_high = high, at_high, guess, at_guess
+        raise wrong_urdf(self.tree.path, "joints", f"no scale gives a reach of {reach_m} m")
 
 
-def _combined(inertials: list[tuple[Inertial, F64]]) -> Inertial | None:
-    """One body of several that are fixed together, in the head's frame (parallel axis theorem)."""
-    if not inertials:
-        return None
-    mass = sum(i.mass_kg for i, _ in inertials)
-    centres = [T[:3, :3] @ i.centre_m + T[:3, 3] for i, T in inertials]
-    centre = np.sum([i.mass_kg * c for (i, _), c in zip(inertials, centres, strict=True)], axis=0) / mass
-    inertia = np.zeros((3, 3))
-    for (i, T), c in zip(inertials, centres, strict=True):
-        d = c - centre
-        R = T[:3, :3]
-        inertia += R @ i.inertia_kgm2 @ R.T + i.mass_kg * (d @ d * np.eye(3) - np.outer(d, d))
-    return Inertial(mass, centre, inertia)
-
-
-def _tube(T_flange: F64, length_m: float, radius_m: float) -> F32:
+def _tube(T_flange: F64, length_m: float, rule: ScaleKeys) -> F32:
     angle = 2 * np.pi * (np.arange(_TUBE_SIDES) + 0.5) / _TUBE_SIDES
-    outer = radius_m / np.cos(np.pi / _TUBE_SIDES)  # the prism's sides touch the tube from outside
+    outer = rule.tube_radius_m / np.cos(np.pi / _TUBE_SIDES)  # the prism's sides touch the tube from outside
     ring = np.stack([outer * np.cos(angle), outer * np.sin(angle), np.zeros(_TUBE_SIDES)], axis=1)
     points = np.concatenate([ring, ring + (0.0, 0.0, length_m)])
     return (points @ T_flange[:3, :3].T + T_flange[:3, 3]).astype(np.float32)
-
-
-def _fingers(hand: UrdfTree, description: HandDescription) -> tuple[Joint, Joint]:
-    left, right = (hand.joint(name) for name in description.finger_joints)
-    R = description.T_palm_tcp[:3, :3]
-    for joint, side in ((left, 1.0), (right, -1.0)):
-        where = f"joint {joint.name}"
-        if joint.kind != "prismatic" or joint.parent != description.palm_link:
-            raise _wrong(hand.path, where, f"does not slide on {description.palm_link}")
-        if joint.lower > 0.0 or joint.upper < 1e-3:
-            raise _wrong(
-                hand.path, where, f"its range {joint.lower} to {joint.upper} m does not open the hand"
-            )
-        if not np.allclose(R.T @ joint.T_parent_child[:3, :3] @ joint.axis, (0.0, side, 0.0), atol=1e-6):
-            raise _wrong(hand.path, where, "does not move along y of the TCP")
-    if abs(left.upper - right.upper) > 1e-9:
-        raise _wrong(hand.path, f"joint {right.name}", "opens less or more than the other finger")
-    return left, right
-
-
-def _scaled_pose(T: F64, scale: float) -> F64:
-    out = T.copy()
-    out[:3, 3] *= scale
-    return out
-
-
-def _wrong(path: Path, field: str, problem: str) -> InputError:
-    return InputError(path, field, problem, "Use the URDF of ManiSkill, or correct the file")
-
-
-_STARTS = 32
-_SWEEPS = 200
-_SETTLED_M = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class Chain:
-    """Revolute joints from a base to a point, the TCP."""
-
-    T_parent_joint: F64  # (A, 4, 4), joint frames at zero in the frame before
-    axis: F64  # (A, 3), unit, joint frame
-    lower_rad: F64  # (A,)
-    upper_rad: F64  # (A,)
-    tcp_m: F64  # (3,), in the last joint's frame
-
-
-def largest_reach_m(chain: Chain) -> float:
-    """The largest distance from the first joint's origin to the TCP within the limits, metres.
-
-    Coordinate ascent from 32 fixed starts. Turning one joint alone moves the TCP on a circle, and its
-    squared distance to any fixed point is a + b cos(q - c), so each step is exact.
-    """
-    parts = (chain.T_parent_joint, chain.axis, chain.lower_rad, chain.upper_rad, chain.tcp_m)
-    return _largest_reach_m(*(part.tobytes() for part in parts))
-
-
-# Scaled arms need the same chains again: the bounds of the search for their scale, and its result.
-@lru_cache(maxsize=256)
-def _largest_reach_m(*parts: bytes) -> float:
-    T, axes, lower_rad, upper_rad, tcp_m = map(np.frombuffer, parts)
-    chain = Chain(T.reshape(-1, 4, 4), axes.reshape(-1, 3), lower_rad, upper_rad, tcp_m)
-    count = len(chain.axis)
-    rng = np.random.Generator(np.random.PCG64(0))
-    lower, upper = np.maximum(chain.lower_rad, -np.pi), np.minimum(chain.upper_rad, np.pi)
-    q = rng.uniform(lower, upper, (_STARTS, count))  # (S, A)
-    best = np.zeros(_STARTS)
-    cross = [_cross_matrix(axis) for axis in chain.axis]
-    for _ in range(_SWEEPS):
-        # The TCP in each joint's own frame, before that joint turns: (S, 3) for every joint.
-        points = [np.broadcast_to(chain.tcp_m, (_STARTS, 3))]
-        for k in range(count - 1, 0, -1):
-            T = chain.T_parent_joint[k]
-            points.append(_turned(points[-1], chain.axis[k], cross[k], q[:, k]) @ T[:3, :3].T + T[:3, 3])
-        points.reverse()
-        shoulder = np.zeros((_STARTS, 3))  # in the frame of joint k, after it has turned
-        for k in range(1, count):
-            T = chain.T_parent_joint[k]
-            seen = (shoulder - T[:3, 3]) @ T[:3, :3]  # in the frame of joint k before it turns
-            axis, tcp = chain.axis[k], points[k]
-            flat = tcp - (tcp @ axis)[:, None] * axis
-            b = np.sum(flat * seen, axis=1)
-            c = np.sum(flat @ cross[k] * seen, axis=1)
-            # Distance^2 = const - 2 (b cos q + c sin q): largest opposite to the angle of (b, c).
-            free = np.arctan2(-c, -b)
-            ends = np.stack([np.full(_STARTS, lower[k]), np.full(_STARTS, upper[k])])
-            near = [-(b * np.cos(e) + c * np.sin(e)) for e in ends]
-            bound = np.where(near[0] >= near[1], lower[k], upper[k])
-            q[:, k] = np.where((free >= lower[k]) & (free <= upper[k]), free, bound)
-            shoulder = _turned(seen, axis, cross[k], -q[:, k])
-        distance = np.linalg.norm(shoulder - chain.tcp_m, axis=1)
-        if np.max(distance - best) < _SETTLED_M:
-            break
-        best = np.maximum(best, distance)
-    return float(best.max())
-
-
-def _turned(points: F64, axis: F64, cross: F64, angle_rad: F64) -> F64:
-    """Points (S, 3) turned about an axis by an angle each (Rodrigues' formula)."""
-    c, s = np.cos(angle_rad)[:, None], np.sin(angle_rad)[:, None]
-    return points * c + points @ cross * s + (points @ axis)[:, None] * axis * (1 - c)
-
-
-def _cross_matrix(axis: F64) -> F64:
-    """(3, 3) that turns rows p into axis x p by p @ M."""
-    x, y, z = axis
-    return np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])

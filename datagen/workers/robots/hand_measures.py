@@ -155,7 +155,7 @@ class HandMeasures:
         return np.column_stack([x, best, z, body])
 
     def _pads(self) -> tuple[float, list[F64]]:
-        """The coordinate at which the fingers meet, and points (P, 4) of both pads there: x, y, z and body."""
+        """The coordinate at which the fingers meet, and points (P, 4) of both pads: x, y, z and body."""
         T = self._poses(0.0)
         corners = [
             part @ T[b, :3, :3].T + T[b, :3, 3]

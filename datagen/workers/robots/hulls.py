@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import re
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,36 +15,42 @@ from typing import Any
 import coal
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
+from datagen.workers.extras import how_to_get
 from datagen.workers.geometry.mesh import F32, F64, I32
-from datagen.workers.robots.description import Parts
+from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.urdf import Shape
 
 # PhysX on a GPU accepts hulls of at most 64 corners, and coal is faster on fewer.
 MAX_CORNERS = 64
 _MAX_BYTES = 64 << 20
-_FIX = "Install mani_skill again, or correct the file"
+_FIX = "Correct the file, or install its package again"
 _BOX_BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
 _TAKEN_AT_ONCE = 4
 _PUSHES = 50
 _TOUCHING_M = 1e-6
+_MOST_FACES, _SHEET_M = 500_000, 0.0005
+_RING = np.stack([f(2 * np.pi * (np.arange(16) + 0.5) / 16) for f in (np.cos, np.sin)], axis=1)
 # Faces, edges and corners of a cube.
 _DIRECTIONS = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 _DIRECTIONS = _DIRECTIONS[np.abs(_DIRECTIONS).sum(axis=1) > 0]
 _DIRECTIONS = _DIRECTIONS / np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)
+# Corners of the polyhedron whose faces touch the unit sphere in these directions.
+_BALL = HalfspaceIntersection(np.column_stack([_DIRECTIONS, -np.ones(26)]), np.zeros(3)).intersections
 
 
 def shape_parts(shape: Shape, scale: float, cuts_m: tuple[float, ...] = ()) -> Parts:
     """Corners (V, 3) each of convex bodies around a shape, in its link's frame, all lengths times `scale`.
 
-    Boxes are exact. A mesh gives one hull, or one for each slab between the heights `cuts_m` along its z
-    axis. Raises InputError naming the mesh that is missing, broken or flat.
+    Boxes are exact; cylinders and spheres lie within prisms that touch them. A mesh gives one hull, or one
+    for each slab between the heights `cuts_m` along its z axis. Raises InputError naming the mesh that is
+    missing or broken.
     """
-    if shape.box_m is not None:
-        hulls = ((_BOX_BITS - 0.5) * shape.box_m,)
+    if shape.size_m is not None:
+        hulls = (_solid(shape.size_m),)
     else:
         assert shape.mesh is not None
         hulls = tuple(hull * shape.scale for hull in mesh_hulls(shape.mesh, cuts_m))
@@ -51,15 +58,33 @@ def shape_parts(shape: Shape, scale: float, cuts_m: tuple[float, ...] = ()) -> P
     return tuple(((hull @ T[:3, :3].T + T[:3, 3]) * scale).astype(np.float32) for hull in hulls)
 
 
-@lru_cache(maxsize=256)
+def _solid(size_m: F64) -> F64:
+    """Corners (V, 3) of a box, or of prisms around a cylinder (radius, length) or a sphere (radius)."""
+    if len(size_m) == 3:
+        return (_BOX_BITS - 0.5) * size_m
+    if len(size_m) == 1:
+        return _BALL * size_m[0]
+    ring = _RING * (size_m[0] / np.cos(np.pi / len(_RING)))
+    return np.concatenate(
+        [np.column_stack([ring, np.full(len(ring), z)]) for z in size_m[1] / 2 * np.array([-1, 1])]
+    )
+
+
+@lru_cache(maxsize=512)
 def mesh_hulls(path: Path, cuts_m: tuple[float, ...] = ()) -> tuple[F64, ...]:
     """Corners (V, 3), at most `MAX_CORNERS`, of convex bodies that contain the mesh between the cuts."""
     points, edges = read_points(path)
     bounds = (-np.inf, *cuts_m, np.inf)
     try:
         return tuple(outer_hull(_slab(points, edges, low, high)) for low, high in itertools.pairwise(bounds))
+    except (QhullError, ValueError):
+        pass
+    # A label or a marker: a sheet of no thickness gets one.
+    thick = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2] * _SHEET_M
+    try:
+        return (outer_hull(np.concatenate([points - thick, points + thick])),)
     except (QhullError, ValueError) as error:
-        raise _wrong(path, "is flat") from error
+        raise _wrong(path, "has no extent") from error
 
 
 def read_points(path: Path) -> tuple[F64, npt.NDArray[np.int64]]:
@@ -69,15 +94,28 @@ def read_points(path: Path) -> tuple[F64, npt.NDArray[np.int64]]:
 
     data = read_regular(path, _MAX_BYTES, _FIX)
     try:
-        mesh = trimesh.load_mesh(io.BytesIO(data), file_type=path.suffix, process=False)
-        points = np.asarray(mesh.vertices, np.float64)
+        mesh = trimesh.load_mesh(io.BytesIO(data), file_type=path.suffix.lower(), process=False)
+        points = np.asarray(mesh.vertices, np.float64) * _unit_m(data, path)
         edges = np.asarray(mesh.edges, np.int64)
-    # The reader raises any of these for a broken mesh.
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+    except ImportError as error:
+        raise InputError(
+            path, "", f"needs {error.name or 'a reader'} to be read", how_to_get("robots")
+        ) from None
+    # Readers raise any of these for a broken mesh.
+    except Exception as error:
         raise _wrong(path, f"is not a mesh ({type(error).__name__})") from error
+    if len(edges) > 3 * _MOST_FACES:
+        fix = f"Simplify it to {_MOST_FACES:,} faces, or leave its link out with arm.ignore"
+        raise InputError(path, "", f"has {len(edges) // 3:,} faces", fix)
     if len(points) < 4 or not np.isfinite(points).all():
         raise _wrong(path, "has fewer than four corners, or one that is not finite")
     return points, edges
+
+
+def _unit_m(data: bytes, path: Path) -> float:
+    """Metres in a unit of the mesh: COLLADA states it, other formats are in metres."""
+    found = re.search(rb'<unit[^>]*meter="([0-9.eE+-]+)"', data) if path.suffix.lower() == ".dae" else None
+    return float(found[1]) if found else 1.0
 
 
 def _slab(points: F64, edges: npt.NDArray[np.int64], low: float, high: float) -> F64:

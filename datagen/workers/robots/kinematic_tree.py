@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,13 +13,12 @@ Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
-class KinematicTree:
+class KinematicTree(NamedTuple):
     """J joints, each after the one that carries it, moved by A coordinates, and F frames on them.
 
-    Joint j stands at `ratio[j] * q[coordinate[j]] + offset[j]`: radians where it turns, metres where it slides.
-    Joints that share a coordinate move together, such as mimic joints and the segments of a telescope. The last
-    frame is the TCP.
+    Joint j stands at `ratio[j] * q[coordinate[j]] + offset[j]`: radians where it turns, metres where it
+    slides. Joints that share a coordinate move together, such as mimic joints and the segments of a
+    telescope. The last frame is the TCP.
     """
 
     parent: Ints  # (J,), the joint that carries each; -1 is the base
@@ -33,3 +32,31 @@ class KinematicTree:
     upper: F64  # (A,)
     frame_joint: Ints  # (F,), the joint that carries each frame; -1 is the base
     T_joint_frame: F64  # (F, 4, 4)
+
+
+def frame_poses(tree: KinematicTree, q: F64, tcp_only: bool = False) -> F64:
+    """Poses (M, F, 4, 4) of the frames, or (M, 1, 4, 4) of the TCP, at coordinates (M, A); base frame."""
+    base, joints = np.eye(4)[None], list[F64]()
+    position = tree.ratio * q[:, tree.coordinate] + tree.offset  # (M, J)
+    for j, parent in enumerate(tree.parent.tolist()):
+        before = np.matmul(joints[parent] if parent >= 0 else base, tree.T_parent_joint[j])
+        joints.append(np.matmul(before, joint_motion(tree.axis[j], bool(tree.slides[j]), position[:, j])))
+    rows = range(len(tree.frame_joint))[-1:] if tcp_only else range(len(tree.frame_joint))
+    out = np.empty((len(q), len(rows), 4, 4))
+    for k, f in enumerate(rows):
+        j = int(tree.frame_joint[f])
+        out[:, k] = np.matmul(joints[j] if j >= 0 else base, tree.T_joint_frame[f])
+    return out
+
+
+def joint_motion(axis: F64, slides: bool, position: F64) -> F64:
+    """Motions (M, 4, 4) of a joint by positions (M,), radians or metres, along or about its axis (3,)."""
+    T = np.tile(np.eye(4), (len(position), 1, 1))
+    if slides:
+        T[:, :3, 3] = position[:, None] * axis
+        return T
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    s, c = np.sin(position)[:, None, None], np.cos(position)[:, None, None]
+    T[:, :3, :3] += s * K + (1 - c) * (K @ K)
+    return T

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -13,13 +14,17 @@ import pinocchio
 from scipy.linalg import lapack
 from scipy.spatial import ConvexHull
 
-from datagen.schemas.identity import digest_of
+from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import F32, F64, Mesh, concatenate
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.houses.glb import read_glb
-from datagen.workers.robots.assembly import Assembly, LinkBody, assemble
-from datagen.workers.robots.description import Gripper, HandDescription, Parts, RobotDescription
+from datagen.workers.robots.assembly import TURN, assemble
+from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.hulls import hull_faces, polyhedron
+from datagen.workers.robots.kinematic_tree import KinematicTree
+from datagen.workers.robots.links import LinkBody
+from datagen.workers.robots.robot_file import RobotSource
+from datagen.workers.robots.tucked import tucked_poses
 
 # Their binary modules have no types.
 pin: Any = pinocchio
@@ -41,44 +46,51 @@ _MOST = 0.5
 
 
 class Robot:
-    """A robot at one mount height, moved by pinocchio. A joints move the arm; L links carry its shape.
+    """A robot at one mount height, moved by pinocchio. A coordinates move the arm; L links carry its shape.
 
-    Base frame: the arm's mount, at (x, y, base_height_m) in the world, z up, x to the front. Equal
-    arguments give equal numbers on every machine of one platform.
+    Base frame: the arm's mount, at (x, y, base_height_m) in the world, z up, x to the front. Coordinates are
+    radians, and metres where joints slide. Equal arguments give equal numbers on every machine of one
+    platform.
     """
 
-    def __init__(self, description: RobotDescription, reach_m: float | None, base_height_m: float) -> None:
-        lift = description.lift
-        lift_m = base_height_m - lift.mount_at_zero_m if lift else 0.0
-        assembly = assemble(description, reach_m, lift_m)
-        self.name = description.name  # as the registry and the specification name it
-        # Largest distance from the first joint that moves the TCP to the TCP.
+    def __init__(self, source: RobotSource, reach_m: float | None = None) -> None:
+        assembly = assemble(source, reach_m)
+        hand, base = assembly.hand, assembly.base
+        self.source = source
+        self.name = source.name  # as the registry and the specification name it
+        # Largest distance from the shoulder to the TCP.
         self.reach_m: float = assembly.reach_m if reach_m is None else reach_m
         self.scale = assembly.scale
-        self.base_height_m = base_height_m
-        self.base_radius_m = description.limits.base_radius_m  # None stands on a pedestal
-        self.gripper = _gripper(description.hand, assembly)
-        self._tcp_wrist_m: F64 = inverse(assembly.palm.T_parent_child @ assembly.T_palm_tcp)[:3, 3]
+        self.base_height_m = base.height_m or 0.0
+        self.base = base
+        self.base_radius_m = base.radius_m  # None stands on a pedestal
+        self.presents = source.keys.base.presents  # how the base stands to the target
+        self.gripper = hand.gripper
+        self._tcp_wrist_m: F64 = inverse(assembly.palm.T_parent_child @ hand.T_palm_tcp)[:3, 3]
         slack_m = POSITION_TOLERANCE_M + ANGLE_TOLERANCE_RAD * float(np.linalg.norm(self._tcp_wrist_m))
         self._wrist_reach_m = assembly.wrist_reach_m + slack_m + _ROUNDING_M
         self.T_base_root: F64 = inverse(assembly.T_root_mount)  # (4, 4), pose of the URDF's root link
         # (3,), base frame: the point that reach_m is measured from; no TCP is ever farther.
-        self.shoulder_m: F64 = (self.T_base_root @ assembly.arm[0].T_parent_child)[:3, 3]
-        self.joint_names = tuple(joint.name for joint in assembly.arm)  # (A,) from the base on
-        self.finger_joint_names = (assembly.fingers[0].name, assembly.fingers[1].name)
-        self.q_lower_rad: F64 = np.array([joint.lower for joint in assembly.arm])  # (A,)
-        self.q_upper_rad: F64 = np.array([joint.upper for joint in assembly.arm])  # (A,)
-        self.speed_limit_radps: F64 = np.array([joint.speed for joint in assembly.arm])  # (A,)
-        self.homes_rad: F64 = np.array(description.homes_rad)  # (H, A), tucked, free of self-collision
-        self.stiffness = description.stiffness  # drives of the arm, as ManiSkill's agent has them
-        self.damping = description.damping
-        self.force_limit_n = description.force_limit_n
+        self.shoulder_m: F64 = assembly.shoulder_m
+        self.joint_names = assembly.names  # (A,) of the coordinates, from the base on
+        self.slides = assembly.slides  # (A,)
+        self.q_lower_rad: F64 = assembly.lower  # (A,)
+        self.q_upper_rad: F64 = assembly.upper  # (A,)
+        self.speed_limit_radps: F64 = assembly.speed  # (A,)
+        self.drive = source.keys.drive
         self.link_names = tuple(body.name for body in assembly.bodies)  # (L,)
         # (L,) convex parts in link frames, fingers fully open.
         self.link_parts_m: tuple[Parts, ...] = tuple(body.parts_m for body in assembly.bodies)
+        self.first_hand_link = len(assembly.arm) + 1  # the palm; the fingers follow
         self.assembly = assembly
-        self._model = _model_of(assembly, self.T_base_root)
+        # Whether each link (L,) stands on the floor: what carries the arm.
+        self.is_base = np.arange(len(assembly.bodies)) <= int(assembly.arm[0].name == TURN)
+        self.tree: KinematicTree = assembly.tree()  # the only source of kinematics
+        self._model = _model_of(
+            self.tree, [*(joint.name for joint in assembly.arm)], [*self.link_names, "tcp"]
+        )
         self._data = self._model.createData()
+        self.coordinates = Coordinates.of(self.tree)
         self._tcp = self._model.getFrameId("tcp")
         first = self._tcp - len(self.link_names)
         self._frames = range(first, self._tcp)
@@ -86,9 +98,52 @@ class Robot:
         joints = [frames[f].parentJoint for f in self._frames]
         placements = [frames[f].placement.homogeneous for f in self._frames]
         # One hull a finger is close enough and four times as fast as its boxes.
-        parts = [*self.link_parts_m[:-2], *((_joint_hull(p),) for p in self.link_parts_m[-2:])]
-        self._self_collision = SelfCollision(self._model, parts, joints, placements)
+        fingers = self.link_parts_m[self.first_hand_link + 1 :]
+        parts = [
+            *self.link_parts_m[: self.first_hand_link + 1],
+            *((_joint_hull(p),) if p else () for p in fingers),
+        ]
+        self._self_collision = SelfCollision(self._model, self.coordinates, parts, joints, placements)
         self.self_pairs = self._self_collision.pairs  # pairs of links that must not touch
+        self.homes_rad: F64 = self._tucked()  # (H, A), tucked, free of self-collision
+
+    def _tucked(self) -> F64:
+        """The poses of the file, else of a search. InputError where one touches the robot itself."""
+        given, wrong = self.source.keys.arm.tucked, self.source.wrong
+        if given:
+            homes = np.array(given)
+            if homes.shape[1] != len(self.joint_names):
+                names = ", ".join(self.joint_names)
+                raise wrong(
+                    "arm.tucked",
+                    f"has rows of {homes.shape[1]} numbers",
+                    f"Give {len(self.joint_names)}: {names}",
+                )
+            inside = (homes >= self.q_lower_rad) & (homes <= self.q_upper_rad)
+            for row, is_inside in zip(homes, inside, strict=True):
+                if not is_inside.all():
+                    raise wrong(
+                        "arm.tucked", f"{self.joint_names[int(is_inside.argmin())]} is outside its range"
+                    )
+                if self.scale == 1.0 and self.collides_itself(row):
+                    raise wrong(
+                        "arm.tucked",
+                        f"the pose {row.tolist()} touches the robot itself",
+                        "Correct or omit it",
+                    )
+            return homes
+        floor_m = -self.base_height_m if self.base_radius_m is not None else 0.0
+        homes = tucked_poses(
+            self.tree,
+            self.link_parts_m,
+            self.base_radius_m or 0.2,
+            floor_m,
+            lambda q: not self.collides_itself(q),
+        )
+        if len(homes) == 0:
+            fix = "Give arm.tucked, or leave out links whose hulls overlap with arm.ignore"
+            raise wrong("arm", "no pose is free of self-collision", fix)
+        return homes
 
     def at_height(self, base_height_m: float) -> Robot:
         """The same arm on a pedestal of another height; both share all other data."""
@@ -98,7 +153,7 @@ class Robot:
 
     def T_base_link(self, q_rad: F64) -> F64:
         """Poses (L, 4, 4) of the links at the joints (A,)."""
-        pin.framesForwardKinematics(self._model, self._data, q_rad)
+        pin.framesForwardKinematics(self._model, self._data, self.coordinates(q_rad))
         placements = self._data.oMf
         T = np.empty((len(self._frames), 4, 4))
         for k, frame in enumerate(self._frames):
@@ -107,12 +162,12 @@ class Robot:
 
     def T_base_tcp(self, q_rad: F64) -> F64:
         """Pose (4, 4) of the gripper's TCP at the joints (A,)."""
-        pin.forwardKinematics(self._model, self._data, q_rad)
+        pin.forwardKinematics(self._model, self._data, self.coordinates(q_rad))
         return pin.updateFramePlacement(self._model, self._data, self._tcp).homogeneous
 
     def ik(self, T_base_tcp: F64, q_seed_rad: F64) -> F64 | None:
         """Joints (A,) within the limits that put the TCP at the pose (0.5 mm, 0.5 degrees), or None."""
-        return solve(self._model, self._data, self._tcp, T_base_tcp, q_seed_rad)
+        return solve(self._model, self._data, self._tcp, self.coordinates, T_base_tcp, q_seed_rad)
 
     def is_wrist_within_reach(self, T_base_tcp: F64, beyond_m: float = 0.0) -> npt.NDArray[np.bool_]:
         """Whether the last joint is at most `beyond_m` beyond its reach at each TCP pose (N, 4, 4); (N,).
@@ -131,54 +186,52 @@ class Robot:
         return tuple(_mesh_of(body) for body in self.assembly.bodies)
 
 
-def _model_of(assembly: Assembly, T_base_root: F64) -> Any:
-    """A model with the arm's joints, a frame for every body, fingers open, and one for the TCP."""
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """Positions of a model's joints (J,) from the coordinates (A,): matrix @ q + offset."""
+
+    matrix: F64  # (J, A)
+    offset: F64  # (J,)
+    lower: F64  # (A,)
+    upper: F64  # (A,)
+    are_joints: bool  # each joint has a coordinate of its own, in order
+
+    @staticmethod
+    def of(tree: KinematicTree) -> Coordinates:
+        """Those of a tree."""
+        matrix = np.zeros((len(tree.ratio), len(tree.lower)))
+        matrix[np.arange(len(tree.ratio)), tree.coordinate] = tree.ratio
+        plain = matrix.shape[0] == matrix.shape[1] and bool((matrix == np.eye(len(matrix))).all())
+        return Coordinates(matrix, tree.offset, tree.lower, tree.upper, plain and not tree.offset.any())
+
+    def __call__(self, q: F64) -> F64:
+        return q if self.are_joints else self.matrix @ q + self.offset
+
+    def of_joints(self, positions: F64) -> F64:
+        """Coordinates (A,) of positions (J,), means where joints share one."""
+        if self.are_joints:
+            return positions
+        weights = np.abs(self.matrix)
+        shares = np.divide(positions - self.offset, self.matrix.sum(axis=1))
+        return shares @ weights / weights.sum(axis=0)
+
+
+def _model_of(tree: KinematicTree, joints: Sequence[str], frames: Sequence[str]) -> Any:
+    """pinocchio's model of a tree."""
     model = pin.Model()
-    at = 0
-    placements = [T_base_root]
-    parents = [0]
-    for joint in assembly.arm:
-        T = (T_base_root if at == 0 else np.eye(4)) @ joint.T_parent_child
-        kind = (
-            pin.JointModelRZ()
-            if np.array_equal(joint.axis, (0, 0, 1))
-            else pin.JointModelRevoluteUnaligned(joint.axis)
-        )
-        limits = (np.array([v]) for v in (joint.effort, joint.speed, joint.lower, joint.upper))
-        at = model.addJoint(at, kind, pin.SE3(T), joint.name, *limits)
-        placements.append(np.eye(4))
-        parents.append(at)
-    T_palm = assembly.palm.T_parent_child
-    placements.append(T_palm)
-    for joint in assembly.fingers:
-        slide = np.eye(4)
-        slide[:3, 3] = joint.axis * joint.upper
-        placements.append(T_palm @ joint.T_parent_child @ slide)
-    placements.append(T_palm @ assembly.T_palm_tcp)
-    parents += [at] * 4
-    names = [*(body.name for body in assembly.bodies), "tcp"]
-    for name, joint_id, T in zip(names, parents, placements, strict=True):
-        model.addFrame(pin.Frame(name, joint_id, 0, pin.SE3(T), pin.FrameType.OP_FRAME))
+    ids = [0]
+    for j, name in enumerate(joints):
+        axis = tree.axis[j]
+        if tree.slides[j]:
+            kind = pin.JointModelPrismaticUnaligned(axis)
+        elif np.array_equal(axis, (0, 0, 1)):
+            kind = pin.JointModelRZ()
+        else:
+            kind = pin.JointModelRevoluteUnaligned(axis)
+        ids.append(model.addJoint(ids[tree.parent[j] + 1], kind, pin.SE3(tree.T_parent_joint[j]), name))
+    for name, joint, T in zip(frames, tree.frame_joint, tree.T_joint_frame, strict=True):
+        model.addFrame(pin.Frame(name, ids[joint + 1], 0, pin.SE3(T), pin.FrameType.OP_FRAME))
     return model
-
-
-def _gripper(hand: HandDescription, assembly: Assembly) -> Gripper:
-    from_palm = inverse(assembly.T_palm_tcp)
-    palm, *fingers = assembly.bodies[-3:]
-    palm_parts = tuple(_moved(part, from_palm) for part in palm.parts_m)
-    left, right = (
-        tuple(_moved(part, from_palm @ joint.T_parent_child) for part in body.parts_m)
-        for body, joint in zip(fingers, assembly.fingers, strict=True)
-    )
-    opening = 2 * assembly.fingers[0].upper
-    depth = -max(float(part[:, 2].max()) for part in palm_parts)
-    parts = [part.tolist() for part in (*palm_parts, *left, *right)]
-    digest = digest_of([hand.name, opening, list(hand.pad_size_m), depth, parts])
-    return Gripper(hand.name, digest, opening, hand.pad_size_m, depth, palm_parts, (left, right))
-
-
-def _moved(part: F32, T: F64) -> F32:
-    return (part.astype(np.float64) @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
 
 
 def _joint_hull(parts_m: Parts) -> F32:
@@ -188,13 +241,22 @@ def _joint_hull(parts_m: Parts) -> F32:
 
 
 def _mesh_of(body: LinkBody) -> Mesh:
-    """A body's visual meshes, else its hulls, in the link frame. Raises InputError naming a broken file."""
+    """A body's visual meshes, else its hulls, in the link frame."""
     meshes: list[Mesh] = []
-    for shape in body.visuals:
-        assert shape.mesh is not None
-        T = np.diag([body.scale] * 3 + [1.0]) @ shape.T_link_shape @ np.diag([*shape.scale, 1.0])
-        meshes.append(_read_visual(shape.mesh).transformed(T))
-    return concatenate([*meshes, *(_plain(part) for part in body.drawn_m)])
+    try:
+        for shape in body.visuals:
+            assert shape.mesh is not None
+            T = np.diag([body.scale] * 3 + [1.0]) @ shape.T_link_shape @ np.diag([*shape.scale, 1.0])
+            meshes.append(_read_visual(shape.mesh).transformed(T))
+    except InputError:  # what cannot be read is drawn as its hulls
+        return _meshes(body.parts_m)
+    return concatenate([*meshes, *map(_plain, body.drawn_m)]) if meshes else _meshes(body.drawn_m)
+
+
+def _meshes(parts_m: Parts) -> Mesh:
+    if not parts_m:
+        return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
+    return concatenate(list(map(_plain, parts_m)))
 
 
 def _plain(corners_m: F32) -> Mesh:
@@ -202,18 +264,20 @@ def _plain(corners_m: F32) -> Mesh:
     return Mesh(corners_m, faces, np.full((len(faces), 3), _GREY, np.uint8))
 
 
-def solve(model: Any, data: Any, frame: int, T_base_tcp: F64, q_seed_rad: F64) -> F64 | None:
-    """Joints (A,) within the model's limits that put the frame at the pose (4, 4), or None.
+def solve(
+    model: Any, data: Any, frame: int, coordinates: Coordinates, T_base_tcp: F64, q_seed_rad: F64
+) -> F64 | None:
+    """Coordinates (A,) within their limits that put the frame at the pose (4, 4), or None.
 
     Levenberg-Marquardt with damping that grows with the squared error (Sugihara 2011), on the pose error
     as a twist in the frame itself; a joint at its limit stays there while the step pushes it out.
     """
-    low, high = model.lowerPositionLimit, model.upperPositionLimit
+    low, high = coordinates.lower, coordinates.upper
     goal = pin.SE3(T_base_tcp)
     q = np.minimum(np.maximum(q_seed_rad, low), high)
     best, best_at = np.inf, 0
     for step in range(_MAX_STEPS):
-        pin.computeJointJacobians(model, data, q)
+        pin.computeJointJacobians(model, data, coordinates(q))
         here = pin.updateFramePlacement(model, data, frame)
         error = pin.log6(here.actInv(goal)).vector
         # Plain floats and ndarray.dot: half of the time would go into the wrappers around them.
@@ -227,6 +291,8 @@ def solve(model: Any, data: Any, frame: int, T_base_tcp: F64, q_seed_rad: F64) -
         elif step - best_at >= _PATIENCE:
             return None
         J = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL)
+        if not coordinates.are_joints:
+            J = J @ coordinates.matrix
         H = J.dot(J.T)
         H.flat[::7] += _DAMPING + _DAMPING_PER_ERROR * squared
         dq = J.T.dot(_lapack.dposv(H, error)[1])
@@ -240,18 +306,20 @@ def solve(model: Any, data: Any, frame: int, T_base_tcp: F64, q_seed_rad: F64) -
 class SelfCollision:
     """Narrow-phase checks of pairs of bodies, each made of convex parts fixed to a joint.
 
-    Bodies that are fixed to one another and bodies on both sides of one joint may always touch. Other pairs
-    that touch in most of 300 random configurations (fixed seed) are left out too: their coarse hulls overlap.
+    Bodies that are fixed to one another, bodies on both sides of one joint and the segments of one telescope
+    may always touch. Other pairs that touch in most of 300 random configurations (fixed seed) are left out
+    too: their coarse hulls overlap.
     """
 
     def __init__(
         self,
         model: Any,
+        coordinates: Coordinates,
         parts_m: Sequence[Parts],  # one entry a body, body frame
         joint: Sequence[int],  # the model's joint that each body is fixed to
         T_joint_body: Sequence[F64],
     ) -> None:
-        self._model, self._data = model, model.createData()
+        self._model, self._data, self._coordinates = model, model.createData(), coordinates
         self._geometry = pin.GeometryModel()
         body_of: list[int] = []
         for b, parts in enumerate(parts_m):
@@ -265,12 +333,22 @@ class SelfCollision:
             (a, b)
             for a in range(len(parts_m))
             for b in range(a + 1, len(parts_m))
-            if joint[a] != joint[b] and model.parents[joint[b]] != joint[a]
+            if joint[a] != joint[b] and not self._is_telescope(joint[a], joint[b])
         }
         self._keep(free, body_of)
         self.pairs = tuple(sorted(free - self._touching_often(body_of)))
         self._keep(set(self.pairs), body_of)
         self._results = self._geometry.createData()
+
+    def _is_telescope(self, upper: int, lower: int) -> bool:
+        """Whether one joint lies between two joints' bodies, or several that slide with one coordinate."""
+        between = list[int]()
+        while lower > upper:
+            between.append(lower - 1)
+            lower = self._model.parents[lower]
+        moved = self._coordinates.matrix[between].any(axis=0).sum()
+        slides = all("Prismatic" in self._model.joints[j + 1].shortname() for j in between)
+        return lower == upper and (len(between) == 1 or (slides and moved == 1))
 
     def _keep(self, pairs: set[tuple[int, int]], body_of: list[int]) -> None:
         self._geometry.removeAllCollisionPairs()
@@ -282,13 +360,14 @@ class SelfCollision:
     def _touching_often(self, body_of: list[int]) -> set[tuple[int, int]]:
         results = self._geometry.createData()
         rng = np.random.Generator(np.random.PCG64(0))
-        low, high = self._model.lowerPositionLimit, self._model.upperPositionLimit
+        low, high = self._coordinates.lower, self._coordinates.upper
         pairs = [(body_of[p.first], body_of[p.second]) for p in self._geometry.collisionPairs]
         touched: dict[tuple[int, int], int] = {}
         for left, q in zip(
             reversed(range(_SAMPLES)), rng.uniform(low, high, (_SAMPLES, len(low))), strict=True
         ):
-            pin.computeCollisions(self._model, self._data, self._geometry, results, q, False)
+            joints = self._coordinates(q)
+            pin.computeCollisions(self._model, self._data, self._geometry, results, joints, False)
             found = zip(pairs, results.collisionResults, strict=True)
             for pair in {pair for pair, result in found if result.isCollision()}:
                 touched[pair] = touched.get(pair, 0) + 1
@@ -300,6 +379,7 @@ class SelfCollision:
 
     def touches(self, q_rad: F64) -> bool:
         """Whether any of `pairs` touch at the joints (A,)."""
+        joints = self._coordinates(q_rad)
         return bool(
-            pin.computeCollisions(self._model, self._data, self._geometry, self._results, q_rad, True)
+            pin.computeCollisions(self._model, self._data, self._geometry, self._results, joints, True)
         )

@@ -8,8 +8,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.robots.assembly import LinkBody
 from datagen.workers.robots.hulls import hull_faces
+from datagen.workers.robots.links import LinkBody
 from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.urdf import Inertial, Joint, rotation_rpy
 
@@ -23,7 +23,7 @@ def write_urdf(robot: Robot, folder: Path) -> Path:
     assembly = robot.assembly
     for body in assembly.bodies:
         _add_link(root, body, folder)
-    for joint in (*assembly.arm, assembly.palm, *assembly.fingers):
+    for joint in (*assembly.arm, assembly.palm, *assembly.hand.joints):
         _add_joint(root, joint)
     path = folder / "robot.urdf"
     ElementTree.ElementTree(root).write(path)

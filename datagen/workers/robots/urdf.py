@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,11 +13,13 @@ import numpy as np
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.robots.resources import mesh_path
 
 _MAX_BYTES = 8 << 20
 _MAX_LINKS = 1000
-_FIX = "Install mani_skill again, or correct the file"
+FIX = "Correct the file, or install its package again"
 _MOVING = ("revolute", "continuous", "prismatic")
+_KINDS = (*_MOVING, "fixed", "planar", "floating")
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +33,11 @@ class Inertial:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A box or a mesh in the link frame."""
+    """A box, a cylinder along z, a sphere or a mesh in the link frame."""
 
     T_link_shape: F64  # (4, 4)
-    box_m: F64 | None  # (3,) full sizes
+    # Sizes of a box (3,), radius and length of a cylinder (2,), radius of a sphere (1,); of a mesh None.
+    size_m: F64 | None
     mesh: Path | None
     scale: F64  # (3,) of the mesh
 
@@ -50,10 +54,13 @@ class Link:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """A joint at zero sits at `T_parent_child`. Joints without limits turn freely: (-inf, inf)."""
+    """A joint at zero sits at `T_parent_child`. Those without limits have (-inf, inf).
+
+    A joint that mimics another stands at `multiplier` times its position plus `offset`.
+    """
 
     name: str
-    kind: str  # revolute, continuous, prismatic or fixed
+    kind: str  # one of _KINDS
     parent: str
     child: str
     T_parent_child: F64  # (4, 4)
@@ -62,6 +69,7 @@ class Joint:
     upper: float
     speed: float
     effort: float
+    mimic: tuple[str, float, float] | None = None  # name, multiplier, offset
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +100,54 @@ class UrdfTree:
         """The joint whose child is the link; None for a root."""
         return next((joint for joint in self.joints.values() if joint.child == link), None)
 
+    def chain(self, base: str, tip: str) -> list[Joint]:
+        """All joints from one link down to another. InputError where the tip is not below the base."""
+        self.link(base)
+        self.link(tip)
+        found: list[Joint] = []
+        link = tip
+        while link != base:
+            joint = self.joint_above(link)
+            if joint is None:
+                raise InputError(
+                    self.path, f"link {tip}", f"is not below link {base}", "Correct arm.base or arm.tip"
+                )
+            found.insert(0, joint)
+            link = joint.parent
+        return found
+
+    def driver(self, joint: Joint) -> tuple[Joint, float, float]:
+        """The joint that moves this one, itself where it mimics none, with multiplier and offset."""
+        ratio, offset, seen = 1.0, 0.0, {joint.name}
+        while joint.mimic is not None:
+            name, multiplier, more = joint.mimic
+            joint, ratio, offset = self.joint(name), ratio * multiplier, ratio * more + offset
+            if name in seen:
+                raise _wrong(self.path, f"joint {name}", "mimics itself")
+            seen.add(name)
+        return joint, ratio, offset
+
+    def limits(self, joint: Joint) -> tuple[float, float]:
+        """The range of a joint that moves; half a turn each way where it turns freely."""
+        if joint.kind not in _MOVING:
+            raise _wrong(self.path, f"joint {joint.name}", f"is {joint.kind}; joints of an arm turn or slide")
+        if joint.kind == "continuous":
+            return -np.pi, np.pi
+        if math.isinf(joint.lower):
+            raise _wrong(self.path, f"joint {joint.name}", "has no limit")
+        if not joint.lower < joint.upper:
+            problem = f"its range {joint.lower} to {joint.upper} is empty"
+            raise _wrong(self.path, f"joint {joint.name}", problem)
+        if joint.kind == "prismatic":
+            return joint.lower, joint.upper
+        return max(joint.lower, -2 * np.pi), min(joint.upper, 2 * np.pi)
+
+
+@lru_cache(maxsize=16)
+def read_urdf_once(path: Path, _stamp: tuple[int, int]) -> UrdfTree:
+    """`read_urdf` of a file by its time and size."""
+    return read_urdf(path)
+
 
 def read_urdf(path: Path) -> UrdfTree:
     """All links and joints of a URDF; paths of meshes are resolved against its folder.
@@ -99,10 +155,16 @@ def read_urdf(path: Path) -> UrdfTree:
     Raises InputError naming the file and the element: unreadable, not XML, a number that is not
     finite, a joint between links that do not exist, two parents of one link, a loop.
     """
+    data = read_regular(path, _MAX_BYTES, FIX)
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+        raise _wrong(path, "", "declares a document type; a URDF has none")
     try:
-        root = ElementTree.fromstring(read_regular(path, _MAX_BYTES, _FIX))
-    except ElementTree.ParseError as error:
+        root = ElementTree.fromstring(data)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise _wrong(path, "", f"is not XML ({error})") from error
+    if any("ros.org/wiki/xacro}" in element.tag for element in root.iter()) or path.suffix == ".xacro":
+        command = f"xacro {path.name} > {path.name.split('.')[0]}-expanded.urdf"
+        raise InputError(path, "", "is a xacro file", f"Expand it, and name the result: {command}")
     if root.tag != "robot":
         raise _wrong(path, root.tag, "is not <robot>")
     if max(len(root.findall("link")), len(root.findall("joint"))) > _MAX_LINKS:
@@ -123,7 +185,12 @@ def read_urdf(path: Path) -> UrdfTree:
             above, steps = tree.joint_above(above.parent), steps + 1
             if steps > len(links):
                 raise _wrong(path, f"link {name}", "its joints form a loop")
+    for joint in joints.values():
+        tree.driver(joint)
     return tree
+
+
+_SIZES = {"box": [("size", 3)], "cylinder": [("radius", 1), ("length", 1)], "sphere": [("radius", 1)]}
 
 
 class _Reader:
@@ -179,24 +246,25 @@ class _Reader:
 
     def shape(self, element: ElementTree.Element, where: str) -> Shape:
         T = self.origin(element, where)
-        box, mesh = element.find("geometry/box"), element.find("geometry/mesh")
-        if box is not None:
-            return Shape(T, self.numbers(box, "size", 3, where, ""), None, np.ones(3))
+        for kind, keys in _SIZES.items():
+            solid = element.find(f"geometry/{kind}")
+            if solid is not None:
+                size_m = np.concatenate([self.numbers(solid, key, n, where, "") for key, n in keys])
+                if not (size_m > 0).all():
+                    raise _wrong(self.path, where, f"its {kind} has no volume")
+                return Shape(T, size_m, None, np.ones(3))
+        mesh = element.find("geometry/mesh")
         if mesh is None:
-            raise _wrong(self.path, where, "has neither a box nor a mesh")
-        return Shape(
-            T,
-            None,
-            self.path.parent / mesh.get("filename", "").removeprefix("package://"),
-            self.numbers(mesh, "scale", 3, where, "1 1 1"),
-        )
+            raise _wrong(self.path, where, f"has no {', '.join(_SIZES)} or mesh")
+        file = mesh_path(mesh.get("filename", ""), self.path)
+        return Shape(T, None, file, self.numbers(mesh, "scale", 3, where, "1 1 1"))
 
     def joint(self, element: ElementTree.Element) -> Joint:
         name = self.name(element)
         where = f"joint {name}"
         kind = element.get("type", "")
-        if kind not in (*_MOVING, "fixed"):
-            raise _wrong(self.path, where, f"type {kind!r} is not one of {', '.join(_MOVING)}, fixed")
+        if kind not in _KINDS:
+            raise _wrong(self.path, where, f"type {kind!r} is not one of {', '.join(_KINDS)}")
         parent, child = element.find("parent"), element.find("child")
         if parent is None or child is None:
             raise _wrong(self.path, where, "has no parent or no child")
@@ -211,16 +279,19 @@ class _Reader:
             if limit is not None:
                 speed = float(self.numbers(limit, "velocity", 1, where, "0")[0])
                 effort = float(self.numbers(limit, "effort", 1, where, "0")[0])
-            if kind != "continuous":
-                if limit is None:
-                    raise _wrong(self.path, where, "has no limit")
-                lower = float(self.numbers(limit, "lower", 1, where, "0")[0])
-                upper = float(self.numbers(limit, "upper", 1, where, "0")[0])
-                if not lower < upper:
-                    raise _wrong(self.path, where, f"its range {lower} to {upper} is empty")
+                if kind != "continuous":
+                    lower = float(self.numbers(limit, "lower", 1, where, "0")[0])
+                    upper = float(self.numbers(limit, "upper", 1, where, "0")[0])
+        mimic, found = element.find("mimic"), None
+        if mimic is not None and kind in _MOVING:
+            ratio, offset = (
+                float(self.numbers(mimic, key, 1, where, default)[0])
+                for key, default in (("multiplier", "1"), ("offset", "0"))
+            )
+            found = (mimic.get("joint", ""), ratio, offset)
         return Joint(
             name, kind, parent.get("link", ""), child.get("link", ""), self.origin(element, where),
-            axis, lower, upper, speed, effort,
+            axis, lower, upper, speed, effort, found,
         )  # fmt: skip
 
 
@@ -257,4 +328,4 @@ def scaled_inertial(inertial: Inertial, scale: float) -> Inertial:
 
 
 def _wrong(path: Path, field: str, problem: str) -> InputError:
-    return InputError(path, field, problem, _FIX)
+    return InputError(path, field, problem, FIX)

@@ -39,7 +39,7 @@ def drive_targets(plan: MotionPlan, robot: Robot, params: TrialParams) -> list[C
     Targets are ahead of the path by the drives' lag.
     """
     speed, period_s = robot.speed_limit_radps * SPEED_SHARE, params.control_period_s
-    lag_s = robot.damping / robot.stiffness
+    lag_s = robot.drive.damping / robot.drive.stiffness
     open_m = plan.opening_m / 2
 
     def move(

@@ -109,7 +109,7 @@ class _Trial:
             pedestal_below(prepared, self.T_world_base),
             disturbed_things(prepared, self.disturbance),
             prepared.robot,
-            prepared.articulation,
+            prepared.articulation_at(plan.opening_m),
             self.T_world_base,
             self.disturbance.object_friction,
             params,

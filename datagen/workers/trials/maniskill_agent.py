@@ -11,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import torch
 from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.agents.controllers.pd_joint_pos import (
@@ -21,6 +22,7 @@ from mani_skill.agents.controllers.pd_joint_pos import (
 )
 from mani_skill.agents.registration import register_agent
 
+from datagen.schemas.errors import InputError
 from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.robot_files import write_urdf
 from datagen.workers.trials.drive_targets import FINGER_DAMPING, FINGER_STIFFNESS
@@ -56,7 +58,13 @@ def agent_of(robot: Robot, grip_force_n: float) -> type[BaseAgent]:
 
     Actions (A + 1,): targets of the arm's joints in radians and of both fingers in metres, not normalised.
     """
-    first, second = robot.finger_joint_names
+    if robot.gripper.linkage is not None or not robot.coordinates.are_joints:
+        fix = "Use a robot with two sliding fingers and a coordinate for every joint, such as panda or fetch"
+        raise InputError("DatagenGrasp-v1", robot.name, "cannot be an agent of ManiSkill", fix)
+    first, second = (joint.name for joint in robot.assembly.hand.joints)
+    drive = robot.drive
+    stiffness = np.where(robot.slides, drive.slide_stiffness, drive.stiffness)
+    force = np.where(robot.slides, drive.slide_force_limit, drive.force_limit)
 
     class DatagenArm(BaseAgent):
         uid = f"datagen-{robot.name}-{robot.reach_m!r}-{robot.base_height_m!r}-{grip_force_n:g}"
@@ -67,7 +75,8 @@ def agent_of(robot: Robot, grip_force_n: float) -> type[BaseAgent]:
         @property
         def _controller_configs(self) -> Any:
             arm = _ArmConfig(
-                list(robot.joint_names), None, None, robot.stiffness, robot.damping, robot.force_limit_n,
+                list(robot.joint_names), None, None, stiffness.tolist(),
+                (stiffness * drive.damping / drive.stiffness).tolist(), force.tolist(),
                 interpolate=True, normalize_action=False,
             )  # fmt: skip
             fingers = _FingersConfig(

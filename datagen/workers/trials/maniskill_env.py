@@ -145,8 +145,8 @@ class DatagenGraspEnv(BaseEnv):
 
     def _load_agent(self, options: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         super()._load_agent(options, self._root_poses(), build_separate=True)
-        base, shoulder, *_, palm = self.robot.link_names[:-2]
-        fingers = self.robot.link_names[-2:]
+        base, shoulder, *_, palm, first, second = self.robot.link_names
+        fingers = (first, second)
         for link in self.agent.robot.get_links():
             groups = CARRIER if link.name == base else SHOULDER if link.name == shoulder else ARM
             for env, body in enumerate(link._objs):  # pyright: ignore[reportPrivateUsage]
@@ -209,7 +209,7 @@ class DatagenGraspEnv(BaseEnv):
         robot = self.agent.robot
         robot.set_pose(self._root_poses())  # pyright: ignore[reportArgumentType]
         active = [joint.name for joint in robot.get_active_joints()]
-        names = (*self.robot.joint_names, *self.robot.finger_joint_names)
+        names = (*self.robot.joint_names, *(joint.name for joint in self.robot.assembly.hand.joints))
         q = np.zeros((self.num_envs, len(active)), np.float32)
         for env, task in enumerate(self.tasks):
             start = [*task.plan.q_reach_rad[0], task.plan.opening_m / 2, task.plan.opening_m / 2]

@@ -119,7 +119,8 @@ class TrialWorld:
         tune_body(self._arm)
         joints = self._arm.get_active_joints()
         columns = {joint.name: k for k, joint in enumerate(joints)}
-        self._columns = np.array([columns[n] for n in (*robot.joint_names, *robot.finger_joint_names)])
+        self._columns = np.array([columns[body.joint] for body in articulation.bodies[1:]])
+        self._coordinates = robot.coordinates
         self._joints = [joints[k] for k in self._columns]
         self._fingers = links[-2:]
 
@@ -134,12 +135,12 @@ class TrialWorld:
 
     def place_arm(self, q_rad: F64, opening_m: float) -> None:
         """Put the arm at joints (A,) at rest, and its drives' targets there."""
-        q = np.concatenate([q_rad, [opening_m / 2] * 2])
+        q = np.concatenate([self._coordinates(q_rad), [opening_m / 2] * 2])
         ordered = np.empty(len(q), np.float32)
         ordered[self._columns] = q
         self._arm.set_qpos(ordered)
         self._arm.set_qvel(np.zeros_like(ordered))
-        self._drive(q.tolist())
+        self._set_targets(q.tolist())
 
     def drive(self, steps: int, start: F64, end: F64, first: int = 0) -> None:
         """Simulate steps `first` to `steps` while the targets (A + 2,) move evenly from `start` to `end`."""
@@ -181,15 +182,24 @@ class TrialWorld:
             self._things[k].put_to_sleep()
 
     def _drive(self, targets: list[float]) -> None:
-        for joint, target in zip(self._joints, targets, strict=True):
+        if not self._coordinates.are_joints:
+            q = np.array(targets)
+            targets = [*self._coordinates(q[:-2]).tolist(), *targets[-2:]]
+        self._set_targets(targets)
+
+    def _set_targets(self, positions: list[float]) -> None:
+        for joint, target in zip(self._joints, positions, strict=True):
             joint.set_drive_target(target)
 
     # -- measurements -------------------------------------------------------------------------------
 
     @property
     def joints(self) -> F64:
-        """Joints (A + 2,): the arm's, then the two fingers' in metres."""
-        return np.asarray(self._arm.get_qpos(), np.float64)[self._columns]
+        """Coordinates (A + 2,): the arm's, then the two fingers' in metres."""
+        found = np.asarray(self._arm.get_qpos(), np.float64)[self._columns]
+        if self._coordinates.are_joints:
+            return found
+        return np.concatenate([self._coordinates.of_joints(found[:-2]), found[-2:]])
 
     @property
     def T_world_object(self) -> F64:
@@ -264,12 +274,13 @@ def _robot_links(
 ) -> list[physx.PhysxArticulationLinkComponent]:
     links: list[physx.PhysxArticulationLinkComponent] = []
     material = physx.PhysxMaterial(friction, friction, 0.0)
+    base, drive, count = int(robot.is_base.sum()), robot.drive, len(articulation.bodies)
     for k, body in enumerate(articulation.bodies):
-        is_finger = body.kind == "prismatic"
+        is_finger = k >= count - 2
         link = physx.PhysxArticulationLinkComponent(links[body.parent] if body.parent >= 0 else None)
         for part in body.parts_m:
             shape = convex_shape(part, material)
-            tune_shape(shape, CARRIER if k == 0 else SHOULDER if k == 1 else ARM)
+            tune_shape(shape, CARRIER if k < base else SHOULDER if k == base else ARM)
             if is_finger:
                 tune_pad(shape, friction, params.finger_friction, sum(robot.gripper.pad_size_m) / 2)
             link.attach(shape)
@@ -288,7 +299,10 @@ def _robot_links(
             joint.set_limits([[body.lower, body.upper]])
             if is_finger:
                 joint.set_drive_properties(FINGER_STIFFNESS, FINGER_DAMPING, params.grip_force_n, "force")
+            elif body.kind == "prismatic":
+                damping = drive.slide_stiffness * drive.damping / drive.stiffness
+                joint.set_drive_properties(drive.slide_stiffness, damping, drive.slide_force_limit, "force")
             else:
-                joint.set_drive_properties(robot.stiffness, robot.damping, robot.force_limit_n, "force")
+                joint.set_drive_properties(drive.stiffness, drive.damping, drive.force_limit, "force")
         links.append(link)
     return links

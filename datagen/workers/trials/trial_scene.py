@@ -11,7 +11,7 @@ from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import translation
 from datagen.workers.objects.part_merging import merge_parts
-from datagen.workers.robots.assembly import LinkBody
+from datagen.workers.robots.links import LinkBody
 from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.urdf import Joint, rotation_rpy, rpy_rotation
 from datagen.workers.scenes import SettledScene
@@ -19,6 +19,7 @@ from datagen.workers.trials import Disturbance
 
 # Bodies without mass still need a little, at the joint.
 _LEAST_MASS_KG, _LEAST_INERTIA_KGM2 = 1e-3, 1e-6
+_LIGHTEST_FINGER_KG = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +50,11 @@ class Articulation:
     T_base_root: F64  # (4, 4), body 0 in the base frame
 
 
-def articulation_of(robot: Robot) -> Articulation:
-    """The bodies that the joints of the arm and of the fingers move."""
+def articulation_of(robot: Robot, opening_m: float = 0.0) -> Articulation:
+    """The bodies that the joints of the arm and of the fingers move.
+
+    Fingers that turn slide here, in the posture that they have at an opening.
+    """
     assembly, count = robot.assembly, len(robot.assembly.arm)
     arm, palm, fingers = (
         assembly.bodies[: count + 1],
@@ -63,9 +67,33 @@ def articulation_of(robot: Robot) -> Articulation:
         carried = [(palm, T_palm)] if k == count - 1 else []
         T = _rounded(joint.T_parent_child)
         bodies.append(_body([(arm[k + 1], np.eye(4)), *carried], k, joint, T))
-    for body, joint in zip(fingers, assembly.fingers, strict=True):
+    if robot.gripper.linkage is not None:
+        T_last_tcp = assembly.palm.T_parent_child @ assembly.hand.T_palm_tcp
+        for side, parts in zip((1.0, -1.0), robot.gripper.fingers_near(opening_m), strict=True):
+            bodies.append(_sliding_finger(robot, parts, side, count, T_last_tcp, fingers))
+        return Articulation(tuple(bodies), robot.T_base_root)
+    for body, joint in zip(fingers, assembly.hand.joints, strict=True):
         bodies.append(_body([(body, np.eye(4))], count, joint, T_palm @ _rounded(joint.T_parent_child)))
     return Articulation(tuple(bodies), robot.T_base_root)
+
+
+def _sliding_finger(
+    robot: Robot,
+    parts: tuple[F32, ...],
+    side: float,
+    parent: int,
+    T_last_tcp: F64,
+    links: tuple[LinkBody, ...],
+) -> MovingBody:
+    """A finger as one body that slides along y of the TCP, with half the mass of the hand's moving links."""
+    axis, mass = np.array([0.0, side, 0.0]), sum(link.inertial.mass_kg for link in links if link.inertial) / 2
+    T_body_joint = np.eye(4)
+    T_body_joint[:3, :3] = _x_onto(axis)
+    T_principal = translation(*np.concatenate(parts).mean(axis=0).tolist())
+    return MovingBody(
+        parent, f"finger{side:+.0f}", "prismatic", T_last_tcp @ T_body_joint, T_body_joint, 0.0,
+        robot.gripper.max_opening_m / 2, parts, max(mass, _LIGHTEST_FINGER_KG), T_principal, np.full(3, 1e-4),
+    )  # fmt: skip
 
 
 def _rounded(T: F64) -> F64:
@@ -152,6 +180,14 @@ class TrialScene:
     parts_m: tuple[tuple[F32, ...], ...]  # (K,) of the objects, merged
     mass_kg: F64  # (K,)
     T_world_object: F64  # (K, 4, 4)
+
+    def articulation_at(self, opening_m: float) -> Articulation:
+        """The robot's bodies, with fingers that turn as they stand at an opening."""
+        return (
+            self.articulation
+            if self.robot.gripper.linkage is None
+            else articulation_of(self.robot, opening_m)
+        )
 
 
 def prepare_trials(
