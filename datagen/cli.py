@@ -72,6 +72,7 @@ _HEADINGS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "This machine": {
         "assets": ("datagen.assets.cli:app", "List, fetch and split houses and objects."),
+        "robot": ("datagen.commands.robot:robot", "Open a robot's file; print, measure and draw it."),
         "doctor": ("datagen.doctor:doctor", "Check this machine, and show how to fix what is missing."),
     },
 }

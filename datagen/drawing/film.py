@@ -67,7 +67,7 @@ class View:
     """A camera at `eye_m` that fits points (N, 3) into its image, and the house without walls before it."""
 
     def __init__(self, eye_m: F64, points_m: F64, size_px: tuple[int, int]) -> None:
-        self.points_m, self.size_px, self.house = points_m, size_px, _no_house()
+        self.points_m, self.size_px, self.house = points_m, size_px, no_house()
         self.T = look_at(eye_m, (points_m.min(0) + points_m.max(0)) / 2)
         self._empty: Pixels | None = None  # the house alone
 
@@ -112,7 +112,7 @@ class Film:
         recording, rays = self.recording, self.scene.rays
         robot = self.bodies.poses(self.T_world_base, recording.q_rad[row], float(recording.opening_m[row]))
         return RayScene(
-            _no_house(),
+            no_house(),
             [*rays.objects, *self.bodies.rays],
             np.concatenate([rays.radii_m, self.bodies.radii_m]),
             np.concatenate([recording.T_world_object[row], robot]),
@@ -213,9 +213,9 @@ def _cell(film: Film, row: int, words: str, sharpness: int, is_stacked: bool) ->
     cell = Image.new("RGB", (near.width + place[0], max(top + wide.height, near.height + place[1])), _PAPER)
     draw, (time, state) = ImageDraw.Draw(cell), film.state(row)
     draw.rectangle((0, 0, cell.width - 1, 7), fill=PHASE_COLOURS.get(film.recording.phase[row], _PALE))
-    draw.text((0, 9), words, _INK, _font(_TEXT_PX, bold=True))
-    draw.text((cell.width, 9), time, _PALE, _font(_TEXT_PX - 2), anchor="ra")
-    draw.text((0, 9 + round(1.25 * _TEXT_PX)), state, _PALE, _font(_TEXT_PX - 2))
+    draw.text((0, 9), words, _INK, font_of(_TEXT_PX, bold=True))
+    draw.text((cell.width, 9), time, _PALE, font_of(_TEXT_PX - 2), anchor="ra")
+    draw.text((0, 9 + round(1.25 * _TEXT_PX)), state, _PALE, font_of(_TEXT_PX - 2))
     cell.paste(wide, (0, top))
     cell.paste(near, place)
     return cell
@@ -224,7 +224,7 @@ def _cell(film: Film, row: int, words: str, sharpness: int, is_stacked: bool) ->
 def _title(colour: str, lines: Sequence[str]) -> Image.Image:
     """A patch of the colour with the first line, and the other lines below it."""
     chip_px, left = round(1.3 * _TEXT_PX), 2 * _GAP_PX
-    head, plain = _font(chip_px, bold=True), _font(_TEXT_PX)
+    head, plain = font_of(chip_px, bold=True), font_of(_TEXT_PX)
     widths = [left + chip_px + head.getlength(lines[0]), *map(plain.getlength, lines[1:])]
     height = round((0.5 + 1.4 * len(lines)) * _TEXT_PX) + 2 * _GAP_PX
     title = Image.new("RGB", (left + round(max(widths)), height), _PAPER)
@@ -236,7 +236,8 @@ def _title(colour: str, lines: Sequence[str]) -> Image.Image:
     return title
 
 
-def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+def font_of(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+    """The font of pictures in a size in pixels."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), size)
 
@@ -303,11 +304,11 @@ def _is_wall(body: StaticBody) -> bool:
 def _rays_without(house: House, left_out: Sequence[StaticBody]) -> RayMesh:
     names = {body.body_id for body in left_out}
     kept = [body.visual for body in house.bodies if body.body_id not in names]
-    return ray_mesh(concatenate(kept)) if kept else _no_house()
+    return ray_mesh(concatenate(kept)) if kept else no_house()
 
 
 @lru_cache(maxsize=1)
-def _no_house() -> RayMesh:
+def no_house() -> RayMesh:
     """A mesh that no ray hits: a speck far below the ground."""
     speck = np.array([[0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0]], np.float32) - np.float32(1e4)
     faces: npt.NDArray[np.int32] = np.array([[0, 1, 2]], np.int32)
