@@ -27,7 +27,7 @@ from datagen.workers.grasps.targets import JUDGED_GRASPS, Targets, is_graspable
 from datagen.workers.objects import open_objects
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots import gripper_of
-from datagen.workers.robots.description import Gripper
+from datagen.workers.robots.gripper import Gripper
 
 _STABILITY_GRASPS = 8  # settled with each object
 _VARIANTS = {

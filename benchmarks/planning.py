@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 
 from benchmarks.options import scene_options
-from benchmarks.robots import robots_folder
 from datagen.configuration.specify import specify
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.run_records import StageClock
@@ -37,6 +36,7 @@ from datagen.workers.motion.plan_candidate import plan_candidate
 from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
 from datagen.workers.objects import open_objects
 from datagen.workers.robots import open_robot, robot_limits
+from datagen.workers.robots.resources import package_folders
 from datagen.workers.scenes import Scene
 from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.world import World, assemble_world
@@ -186,7 +186,7 @@ def _print_split(spent: Spent) -> None:
 
 
 def _print_peer(python: str, problems: list[dict[str, Any]], spent: Spent) -> None:
-    folder = robots_folder() / "panda"
+    folder = next(package_folders("mani_skill")) / "assets/robots/panda"
     question = {
         "urdf": str(folder / "panda_v2.urdf"),
         "srdf": str(folder / "panda_v2.srdf"),

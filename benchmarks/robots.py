@@ -22,9 +22,8 @@ import numpy as np
 
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import quaternion_wxyz
-from datagen.workers.registry import entry
-from datagen.workers.robots import ROBOTS, open_robot
-from datagen.workers.robots.description import robots_folder
+from datagen.workers.robots import open_robot, robot_source
+from datagen.workers.robots.resources import package_folders
 from datagen.workers.robots.robot import Robot
 
 CASES = (
@@ -33,7 +32,7 @@ CASES = (
     ("panda-scaled", 0.6, 0.8),
     ("panda-scaled", 1.0, 0.8),
     ("xarm7", None, 0.8),
-    ("fetch", None, 0.8),
+    ("fetch", None, 0.726),
 )
 PEER_SEEDS = (1, 20)  # 20 is mplib's default
 PEER_PLANS = 50
@@ -58,7 +57,7 @@ def _print_robot(name: str, reach_m: float | None, height_m: float, count: int) 
     # Opened before: a process loads meshes and hulls once, not in every scene.
     robot = open_robot(name, reach_m, height_m)
     started = time.process_time()
-    Robot(entry(ROBOTS, name, "--robot"), reach_m, height_m)
+    Robot(robot_source(name), reach_m)
     opened_ms = (time.process_time() - started) * 1e3
     rng = np.random.default_rng(0)
     q = _random(robot, rng, count)
@@ -94,9 +93,10 @@ def _print_peer(python: str, count: int) -> None:
     q = np.array([x for x in _random(robot, rng, 3 * count) if not robot.collides_itself(x)][:count])
     poses = [robot.T_base_tcp(x) for x in q]
     start = robot.homes_rad[0]
+    folder = next(package_folders("mani_skill")) / "assets/robots/panda"
     question = {
-        "urdf": str(robots_folder() / "panda" / "panda_v2.urdf"),
-        "srdf": str(robots_folder() / "panda" / "panda_v2.srdf"),
+        "urdf": str(folder / "panda_v2.urdf"),
+        "srdf": str(folder / "panda_v2.srdf"),
         "move_group": "panda_hand_tcp",
         "seeds": PEER_SEEDS,
         "start": [*start, 0.04, 0.04],

@@ -17,7 +17,7 @@ from datagen import cli
 from tests.small_runs import arrays_of, json_of, make_small_run
 
 PAGE = Path(__file__).parents[1] / "docs" / "development" / "extending.md"
-_BLOCK = re.compile(r"^```python (file|line)=(\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_BLOCK = re.compile(r"^```(?:python|toml) (file|line)=(\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _ROOM = {"room_m": [4.5, 4.0], "table_m": [1.2, 0.8], "height_m": 0.75}
 
 
@@ -40,12 +40,14 @@ def executed(monkeypatch: pytest.MonkeyPatch, name: str, code: str) -> ModuleTyp
 
 
 @pytest.fixture
-def extended(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
+def extended(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, ModuleType]:
     """Every module of the page, by its file, with its line in its registry; undone after the test."""
     modules: dict[str, ModuleType] = {}
     for kind, place, code in blocks():
         if kind == "file":
-            if not place.startswith("tests/"):
+            if place.endswith(".toml"):
+                (tmp_path / Path(place).name).write_text(code)
+            elif not place.startswith("tests/"):
                 modules[place] = executed(monkeypatch, place.removesuffix(".py").replace("/", "."), code)
             continue
         assert code.count("\n") == 1, f"more than one line for {place}"
@@ -53,7 +55,8 @@ def extended(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
         known: dict[str, Any] = getattr(importlib.import_module(module), registry)
         for name, target in eval("{" + code + "}", {}).items():
             assert name not in known
-            monkeypatch.setitem(known, name, target)
+            file = tmp_path / target  # where the package has no such file
+            monkeypatch.setitem(known, name, str(file) if target.endswith(".toml") else target)
     return modules
 
 
@@ -63,7 +66,7 @@ def test_each_example_is_one_file_one_line_and_one_test() -> None:
         for kind, place, _ in blocks()
     ]
     assert shape == [("file", "workers"), ("line", "workers"), ("file", "tests")] * 4
-    assert PAGE.read_text().count("```python") == len(shape)  # no block escapes this test
+    assert len(re.findall("```(?:python|toml)", PAGE.read_text())) == len(shape)  # no block escapes this test
     for kind, place, _ in blocks():
         if kind == "file":  # it would be a new file, beside the others of its kind
             assert not (PAGE.parents[2] / place).exists()

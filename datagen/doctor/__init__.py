@@ -24,6 +24,7 @@ from rich.text import Text
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, size
 from datagen.doctor import engines
+from datagen.schemas.errors import InputError
 from datagen.workers.content_cache import cache_folder
 from datagen.workers.extras import EXTRAS, how_to_get
 from datagen.workers.robots import ROBOTS, robot_limits
@@ -113,7 +114,10 @@ def checks() -> Iterator[Check]:
             "arm libraries", partial(_probe, engines.LIBRARIES), f"Plan and sim labels need them. {again}"
         )
         for name in ROBOTS:
-            limits = robot_limits(name)
+            try:
+                limits = robot_limits(name)
+            except InputError:
+                continue  # its files are not installed, as the line of the extra says
             height_m = limits.base_height_m[0] if limits.base_height_m else _HEIGHT_M
             code = engines.ROBOT.format(name=name, reach_m=limits.reach_m[1], height_m=height_m)
             yield Check(f"robot {name}", partial(_probe, code), f"Use another --robot, or: {again}")

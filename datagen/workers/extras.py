@@ -30,7 +30,12 @@ class Extra:
 
     def missing(self) -> list[str]:
         """The import names that are not installed."""
-        return [name for name in self.brings if find_spec(name) is None]
+        return [name for name in self.brings if not _is_installed(name)]
+
+
+def _is_installed(name: str) -> bool:
+    """Whether a module can be found, or a distribution without modules: its name has a hyphen."""
+    return bool(versions_of([name])[name]) if "-" in name else find_spec(name) is not None
 
 
 _PICTURES = {"matplotlib": "matplotlib", "PIL": "pillow", "scipy": "scipy"}
@@ -42,11 +47,11 @@ EXTRAS: dict[str, Extra] = {
     ),
     "sim": Extra("plan and sim labels", {"coal": "coal", "pinocchio": "pin", "mani_skill": "mani-skill"}),
     "robots": Extra(
-        "stretch3, tiago-pro, ur5 and pr2; meshes in COLLADA",
+        "robots stretch3, tiago-pro, ur5 and pr2; meshes in COLLADA",
         {
             "stretch_urdf": "hello-robot-stretch-urdf",
             "collada": "pycollada",
-            "example_robot_data": "example-robot-data",
+            "example-robot-data": "example-robot-data",
         },
     ),
     "train": Extra(

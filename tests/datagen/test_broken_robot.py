@@ -20,12 +20,12 @@ pytestmark = needs_sim
 @pytest.fixture
 def environment(tmp_path: Path) -> dict[str, str]:
     """Of a process that finds a ManiSkill whose Panda is cut off in the middle."""
-    from datagen.workers.robots.description import robots_folder
+    from datagen.workers.robots.resources import package_folders
 
     robots = tmp_path / "site" / "mani_skill" / "assets" / "robots"
     (robots / "panda").mkdir(parents=True)
     (tmp_path / "site/mani_skill/__init__.py").touch()
-    source = robots_folder() / "panda"
+    source = next(package_folders("mani_skill")) / "assets/robots/panda"
     (robots / "panda/franka_description").symlink_to(source / "franka_description")
     text = (source / "panda_v2.urdf").read_text()
     (robots / "panda/panda_v2.urdf").write_text(text[: len(text) // 2])
@@ -44,6 +44,6 @@ def test_it_is_refused_for_new_and_for_stored_scenes_and_leaves_no_run(
         )  # fmt: skip
         assert asked.returncode == 2, asked.stderr
         (line,) = without_phases(asked.stderr)
-        assert "panda_v2.urdf: is not XML" in line and "Install mani_skill again" in line
+        assert "panda_v2.urdf: is not XML" in line and "install its package again" in line
         assert not out.exists()
     assert Run.open(source).committed()  # heuristic labels of that robot's candidates need no file of it

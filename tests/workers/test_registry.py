@@ -17,7 +17,6 @@ from datagen.workers.houses import open_houses
 from datagen.workers.labels import load_label_source
 from datagen.workers.objects import open_objects
 from datagen.workers.registry import ALLOWED, allow
-from datagen.workers.robots import open_robot
 from tests.small_runs import arrays_of, submit_arguments
 
 MODULE = """
@@ -26,9 +25,7 @@ from datagen.train.models.shared import SharedModel
 from datagen.workers.houses import open_houses
 from datagen.workers.labels.heuristic_source import HEURISTIC
 from datagen.workers.objects import open_objects
-from datagen.workers.robots.panda import PANDA
 
-ARM = replace(PANDA, name="own arm")
 SOURCE = replace(HEURISTIC, name="own labels")
 
 def open_rooms(text):
@@ -56,7 +53,6 @@ ENTRIES = {
     "own_code:open_rooms:5": lambda ref: len(open_houses(ref).house_ids()) == 5,
     "own_code:open_things": lambda ref: len(open_objects(ref).names()) == 58,
     "own_code:SOURCE": lambda name: load_label_source(name).name == "own labels",
-    "own_code:ARM": lambda name: open_robot(name, None, 0.8).name == "own arm",
     "own_code:model": lambda name: bool(build_model(name, {"width": 32, "embedding": 32})),
 }
 

@@ -104,6 +104,7 @@ def reach_table(robot: Robot, kinematics: Kinematics, draw: int = 0) -> ReachTab
         return (np.round(_with_unit(T, length_m), _DIGITS) + 0.0).tobytes()  # no negative zero
 
     if isinstance(kinematics, TreeKinematics):
+        length_m = robot.reach_m
         q = _random(lower, upper, draw)
         poses = kinematics.tcp(q)
         tcp_wrist_m = T_tcp[:3, :3].T @ (wrist_m - T_tcp[:3, 3])

@@ -134,8 +134,8 @@ def assemble(source: RobotSource, reach_m: float | None) -> Assembly:
     palm = keys.hand.palm or keys.arm.tip
     if keys.hand.urdf is not None and keys.hand.palm is None:
         raise source.wrong("hand.palm", "is missing", "Name the link of the hand's URDF that is mounted")
-    hand = hand_of(source, hand_tree, palm)
     arm = _ArmChain(source, tree, palm)
+    hand = hand_of(source, hand_tree, palm)
     scale, tube_m = 1.0, 0.0
     if keys.scaled is not None and reach_m is not None:
         rule = keys.scaled

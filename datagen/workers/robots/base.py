@@ -63,6 +63,8 @@ def base_of(source: RobotSource, body: LinkBody, joints: tuple[Joint, ...], turn
         ring = radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     else:
         ring = np.zeros((0, 2)) if outline is None else np.array(outline)
+    if len(ring) and not _is_simple(ring):
+        raise wrong("base.footprint_m", "crosses itself or has no area", "Give the corners in order")
     area_m2 = ConvexHull(points[:, :2]).volume if len(points) > 2 else 0.0
     is_in_urdf = area_m2 > (_SHARE * ConvexHull(ring).volume if len(ring) else _LEAST_M2)
     mount_m = shoulder_m if is_in_urdf else np.zeros(3)
@@ -83,12 +85,8 @@ def base_of(source: RobotSource, body: LinkBody, joints: tuple[Joint, ...], turn
         outline = _outline(points[points[:, 2] < floor_m + max(height_m, _OWN_BASE_M)][:, :2] - mount_m[:2])
     if outline is not None:
         ring = np.array(outline)
-        if not _is_simple(ring):
-            raise wrong("base.footprint_m", "crosses itself or has no area", "Give the corners in order")
         if not inside_polygon(np.zeros((1, 2)), ring)[0]:
-            raise wrong(
-                "base.footprint_m", "does not hold the mount, its origin", "Correct it, or base.mount_m"
-            )
+            raise wrong("base.footprint_m", "does not hold the mount, its origin", "Correct it, or base.mount_m")
     deck: F32 | None = None
     if not is_in_urdf and height_m > 2 * _GAP_M:
         levels = (-height_m, min(lowest_m, 0.0) - _GAP_M)

@@ -21,6 +21,7 @@ _PAD_M = 0.0015  # how far from the first contact the surface of a pad may lie
 _MOVES = 0.5  # pads are where the fingers move apart by at least this share of the most
 _LEAST_OPENING_M, _CENTRED_M = 0.005, 0.004
 _HALVINGS = 14
+_IN_PAD = np.linspace(0.0, 1.0, 9)  # where the pads' surfaces are measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,10 +199,17 @@ class HandMeasures:
         before, coordinate = self._poses(q), np.linspace(q, 1.0, _KNOTS)
         opening, depth = np.empty(_KNOTS), np.empty(_KNOTS)
         for k, at in enumerate(coordinate.tolist()):
-            upper, lower = (_carried(rows, before, self._poses(at)) for rows in pads)
-            inner = upper[:, 1].min(), lower[:, 1].max()
-            opening[k], depth[k] = max(inner[0] - inner[1], 0.0), np.concatenate([upper, lower])[:, 2].mean()
-            if abs(sum(inner)) / 2 > _CENTRED_M:
+            moved = np.concatenate([_carried(rows, before, self._poses(at)) for rows in pads])
+            middle = (moved.min(axis=0) + moved.max(axis=0)) / 2
+            depth[k] = middle[2]
+            # As far apart as a box of the pads' size fits between them.
+            ends = [
+                middle[axis] + size * (_IN_PAD - 0.5) for axis, size in zip((0, 2), pad_size_m, strict=True)
+            ]
+            x, z = (grid.ravel() for grid in np.meshgrid(*ends, indexing="ij"))
+            inner = [side * (side * self._surface(at, side, x, z)[:, 1]).min() for side in (1, -1)]
+            opening[k] = max(inner[0] - inner[1], 0.0)
+            if np.isfinite(inner).all() and abs(sum(inner)) / 2 > _CENTRED_M:
                 fix = "Correct hand.tcp, or name joints of both fingers in hand.fingers"
                 raise self._wrong("hand", "its fingers do not close on the middle of its TCP", fix)
         end = int(np.argmax(opening)) + 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.robots.description import Gripper
+from datagen.workers.robots.gripper import Gripper
 from tests.workers.worlds import box_vertices, coloured, model_of
 
 TIP_M = 0.009  # from the pads' middle to the end of the fingers

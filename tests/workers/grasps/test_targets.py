@@ -13,7 +13,7 @@ from datagen.workers.grasps.targets import Targets, is_graspable
 from datagen.workers.objects import open_objects
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots import gripper_of
-from datagen.workers.robots.description import Gripper
+from datagen.workers.robots.gripper import Gripper
 from tests.workers.grasps.shapes import box_gripper
 from tests.workers.worlds import box_model, cylinder_model
 

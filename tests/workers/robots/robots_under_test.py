@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
-from datagen.workers.robots import ROBOTS, open_robot, robot_limits
+import pytest
+
+from datagen.workers.extras import EXTRAS
+from datagen.workers.robots import ROBOTS, open_robot, robot_limits, robot_source
 from datagen.workers.robots.robot import Robot
 
 Case = tuple[str, float | None, float]
 
 _SHARES_OF_REACH = (0.0, 0.1, 0.3, 0.65, 1.0)  # shares of the range of a robot that is scaled
 _ON_PEDESTAL_M = 0.8
+_MISSING = EXTRAS["robots"].missing()
+needs_robots = pytest.mark.skipif(bool(_MISSING), reason="the extra `robots` is not installed")
 
 
 def cases_of(name: str) -> list[Case]:
@@ -28,8 +34,13 @@ def label_of(case: Case) -> str:
     return f"{name}-{reach_m or height_m:g}"
 
 
-CASES = tuple(case for name in ROBOTS for case in cases_of(name))
-IDS = [label_of(case) for case in CASES]
+def _params(name: str) -> list[Any]:
+    if "mani_skill" not in robot_source(name).keys.urdf and _MISSING:
+        return [pytest.param(None, id=name, marks=needs_robots)]
+    return [pytest.param(case, id=label_of(case)) for case in cases_of(name)]
+
+
+CASES = tuple(param for name in ROBOTS for param in _params(name))
 
 
 @lru_cache

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,26 +11,32 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from datagen.schemas.errors import InputError
+from datagen.workers.robots import robot_source
 from datagen.workers.robots.assembly import assemble
-from datagen.workers.robots.description import RobotDescription, robots_folder
-from datagen.workers.robots.panda import FRANKA_HAND, PANDA, PANDA_SCALED
+from datagen.workers.robots.resources import package_folders
+from datagen.workers.robots.robot_file import RobotSource
 from datagen.workers.robots.urdf import read_urdf, rotation_rpy, rpy_rotation
+
+
+def panda_folder() -> Path:
+    return next(package_folders("mani_skill")) / "assets/robots/panda"
 
 
 @pytest.fixture(scope="module")
 def text() -> str:
-    return (robots_folder() / "panda" / "panda_v2.urdf").read_text()
+    return (panda_folder() / "panda_v2.urdf").read_text()
 
 
 @pytest.fixture
 def build(tmp_path: Path, text: str) -> Callable[..., None]:
     """Assembles the Panda, or its scaled arm, from another text of its URDF."""
-    (tmp_path / "franka_description").symlink_to(robots_folder() / "panda" / "franka_description")
+    (tmp_path / "franka_description").symlink_to(panda_folder() / "franka_description")
     urdf = tmp_path / "panda.urdf"
 
-    def run(text: str, robot: RobotDescription = PANDA, reach_m: float | None = None) -> None:
+    def run(text: str, robot: str = "panda", reach_m: float | None = None) -> None:
         urdf.write_text(text)
-        assemble(replace(robot, urdf=str(urdf), hand=replace(FRANKA_HAND, urdf=str(urdf))), reach_m, 0.0)
+        keys = robot_source(robot).keys.model_copy(update={"urdf": str(urdf)})
+        assemble(RobotSource(tmp_path / "robot.toml", keys), reach_m)
 
     return run
 
@@ -40,21 +45,26 @@ def build(tmp_path: Path, text: str) -> Callable[..., None]:
     ("pattern", "other", "field", "said"),
     [
         ("</robot>", "", "", "not XML"),
-        ('name="panda_joint3"', 'name="joint_x"', "panda_joint3", "is missing"),
+        ('<?xml version="1.0" ?>', '<!DOCTYPE r [<!ENTITY a "b">]>', "", "document type"),
+        ("</robot>", '<x:arm xmlns:x="http://www.ros.org/wiki/xacro"/></robot>', "", "is a xacro file"),
         ('"panda_joint8" type="fixed"', '"panda_joint8" type="prismatic"', "panda_joint8", "has no limit"),
-        ('"panda_joint7" type="revolute"', '"panda_joint7" type="fixed"', "panda_joint7", "is fixed"),
+        ('"panda_joint7" type="revolute"', '"panda_joint7" type="floating"', "panda_joint7", "is floating"),
         ('name="panda_joint2" type="revolute"', 'name="panda_joint2" type="ball"', "panda_joint2", "ball"),
         ('lower="-1.7628" upper="1.7628"', 'lower="nan" upper="1.7628"', "panda_joint2", "nan"),
         ('lower="-1.7628" upper="1.7628"', 'lower="1.7628" upper="-1.7628"', "panda_joint2", "empty"),
-        ('lower="0.0" upper="0.04"', 'lower="0.0" upper="0.0001"', "panda_finger_joint1", "open"),
-        ('lower="0.0" upper="0.04"', 'lower="0.01" upper="0.04"', "panda_finger_joint1", "open"),
-        ('<axis xyz="0 -1 0"/>', '<axis xyz="0 1 0"/>', "panda_finger_joint2", "TCP"),
+        ('lower="0.0" upper="0.04"', 'lower="0.0" upper="0.0001"', "hand", "cannot close on anything"),
+        ('lower="0.0" upper="0.04"', 'lower="0.04" upper="0.04"', "hand.range.panda_finger_joint1", "empty"),
+        ('<axis xyz="0 -1 0"/>', '<axis xyz="0 1 0"/>', "hand", "both sides"),
         ('<axis xyz="0 -1 0"/>', '<axis xyz="0 0 0"/>', "panda_finger_joint2", "no length"),
         ('<parent link="panda_link2"/>', '<parent link="panda_linkx"/>', "panda_joint3", "panda_linkx"),
         ('<parent link="panda_link0"/>', '<parent link="panda_link7"/>', "panda_link", "loop"),
         ('<child link="panda_link3"/>', '<child link="panda_link2"/>', "joints", "two parents"),
+        ('<mimic joint="panda_finger_joint1"', '<mimic joint="panda_finger_joint2"', "joint2", "mimics"),
+        ('<mimic joint="panda_finger_joint1"', '<mimic joint="gone"', "gone", "is missing"),
         ("collision/link3.stl", "collision/gone.stl", "", "No such file"),
-        ('<box size="22e-3 15e-3 20e-3"/>', "<cylinder/>", "panda_leftfinger", "neither a box nor a mesh"),
+        ('<box size="22e-3 15e-3 20e-3"/>', "<torus/>", "panda_leftfinger", "has no box, cylinder"),
+        ('<box size="22e-3 15e-3 20e-3"/>', '<cylinder radius="0.01"/>', "panda_leftfinger", "length"),
+        ('<box size="22e-3 15e-3 20e-3"/>', '<sphere radius="0"/>', "panda_leftfinger", "no volume"),
         ('<box size="22e-3 15e-3 20e-3"/>', '<box size="1 2"/>', "panda_leftfinger", "3 finite numbers"),
         ('<mass value="4.970684"/>', '<mass value="-1"/>', "panda_link1", "negative"),
         ('<mass value="4.970684"/>', '<mass value="heavy"/>', "panda_link1", "heavy"),
@@ -68,7 +78,8 @@ def test_broken_urdfs_are_refused_by_field(
     with pytest.raises(InputError) as refused:
         build(text.replace(pattern, other, 1))
     assert field in refused.value.field and said in refused.value.problem
-    assert re.search(r"panda\.urdf|\.stl", refused.value.place)
+    assert re.search(r"panda\.urdf|\.stl|robot\.toml", refused.value.place)
+    assert "\n" not in str(refused.value)
 
 
 def test_a_missing_or_empty_file_is_named(tmp_path: Path) -> None:
@@ -99,10 +110,10 @@ def test_angles_and_rotations_agree(rpy: list[float]) -> None:
 
 
 def test_an_arm_without_lengths_has_no_scale(build: Callable[..., None], text: str) -> None:
-    build(text, PANDA_SCALED, 0.7)  # which is sound
+    build(text, "panda-scaled", 0.7)  # which is sound
     arm, hand = text.split('<link name="panda_hand">')
     arm = re.sub(
         r'(<joint name="panda_joint.*?<origin rpy="[^"]*" xyz=)"[^"]*"', r'\1"0 0 0"', arm, flags=re.S
     )
     with pytest.raises(InputError, match=r"panda\.urdf: joints: no scale gives a reach of 0\.7 m"):
-        build(arm + '<link name="panda_hand">' + hand, PANDA_SCALED, 0.7)
+        build(arm + '<link name="panda_hand">' + hand, "panda-scaled", 0.7)

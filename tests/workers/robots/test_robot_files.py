@@ -1,0 +1,250 @@
+"""Robots from files of the user's: what is derived, what is refused, and what a digest depends on."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
+
+from datagen import cli
+from datagen.schemas.errors import InputError
+from datagen.workers.robots import (
+    open_robot,
+    remember,
+    robot_digest,
+    robot_limits,
+    robot_source,
+)
+from tests.workers.robots.robots_under_test import needs_robots
+
+# A 5-joint arm of plain solids on a box, with a hand of two fingers that pivot.
+LINKS = {
+    "base": '<box size="0.5 0.4 0.3"/>@0 0 0.15',
+    "mast": '<cylinder radius="0.04" length="0.9"/>@0 0 0.45',
+    "shoulder": '<sphere radius="0.05"/>@0 0 0',
+    "upper": '<box size="0.35 0.06 0.06"/>@0.2 0 0',
+    "lower": '<box size="0.3 0.05 0.05"/>@0.18 0 0',
+    "wrist": '<cylinder radius="0.03" length="0.05"/>@0 0 0',
+    "palm": '<box size="0.06 0.12 0.06"/>@0.06 0 0',
+    "left": '<box size="0.12 0.01 0.02"/>@0.06 0 0',
+    "right": '<box size="0.12 0.01 0.02"/>@0.06 0 0',
+}
+LIMIT = '<limit lower="{}" upper="{}" velocity="1" effort="10"/>'
+JOINTS = [
+    ("lift", "prismatic", "base", "mast", "0 0 0.05", "0 0 1", (0.0, 0.4), ""),
+    ("pan", "continuous", "mast", "shoulder", "0.05 0 0.8", "0 0 1", None, ""),
+    ("tilt", "revolute", "shoulder", "upper", "0.06 0 0", "0 1 0", (-1.5, 1.5), ""),
+    ("elbow", "revolute", "upper", "lower", "0.42 0 0", "0 1 0", (-2.5, 2.5), ""),
+    ("roll", "revolute", "lower", "wrist", "0.38 0 0", "1 0 0", (-3.0, 3.0), ""),
+    ("hand", "fixed", "wrist", "palm", "0 0 0", "1 0 0", None, ""),
+    ("open", "revolute", "palm", "left", "0.1 0.006 0", "0 0 1", (0.0, 0.6), ""),
+    ("follow", "revolute", "palm", "right", "0.1 -0.006 0", "0 0 1", (-0.6, 0.0),
+     '<mimic joint="open" multiplier="-1"/>'),
+]  # fmt: skip
+ENDS = 'base = "base"\ntip = "palm"'
+TOML = 'urdf = "robot.urdf"\n\n[arm]\nbase = "base"\ntip = "palm"\n'
+
+
+def urdf_text() -> str:
+    links = []
+    for name, shape in LINKS.items():
+        solid, _, at = shape.partition("@")
+        inside = f'<origin xyz="{at}"/><geometry>{solid}</geometry>'
+        links.append(f'<link name="{name}"><collision>{inside}</collision></link>')
+    joints = [
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{at}"/><axis xyz="{axis}"/>{LIMIT.format(*limits) if limits else ""}{more}</joint>'
+        for name, kind, parent, child, at, axis, limits, more in JOINTS
+    ]
+    return "<robot name='r'>" + "\n".join(links + joints) + "</robot>"
+
+
+Made = Callable[..., str]
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Made:
+    """Writes the robot's files, with a text of each replaced, and returns the path of its TOML file."""
+
+    def write(
+        keys: tuple[str, str] = ("", ""), urdf: tuple[str, str] = ("", ""), folder: str = "a", more: str = ""
+    ) -> str:
+        at = tmp_path / folder
+        at.mkdir(exist_ok=True)
+        assert keys[0] in TOML and urdf[0] in urdf_text()
+        (at / "robot.toml").write_text((TOML.replace(*keys, 1) if keys[0] else TOML) + more)
+        text = urdf_text()
+        (at / "robot.urdf").write_text(text.replace(*urdf, 1) if urdf[0] else text)
+        return str(at / "robot.toml")
+
+    return write
+
+
+def test_everything_is_derived_from_a_file_of_five_lines(make: Made) -> None:
+    name = make()
+    limits = robot_limits(name)
+    assert limits.base_height_m == (0.85, 0.85)
+    assert limits.footprint_m is not None
+    corners = np.array(limits.footprint_m)
+    np.testing.assert_allclose(sorted(corners[:, 0]), [-0.3, -0.3, 0.2, 0.2], atol=0.001)
+    robot = open_robot(name, None, 0.85)
+    assert robot.name == "robot" and robot.joint_names == ("lift", "pan", "tilt", "elbow", "roll")
+    # From the middle of the lift: links of 0.06, 0.42 and 0.38 m and the pads, plus half of the lift.
+    T = robot.assembly.hand.T_palm_tcp
+    np.testing.assert_allclose(T[:3, 2], (1, 0, 0), atol=1e-9)  # the approach
+    assert abs(T[1, 1]) == pytest.approx(1.0) and T[1, 3] == pytest.approx(0.0, abs=1e-3)
+    assert robot.gripper.linkage is not None
+    opening = robot.gripper.linkage.opening_m
+    assert (np.diff(opening) > 0).all() and opening[0] < 0.004 < 0.05 < opening[-1]
+    depth = robot.gripper.linkage.depth_m
+    assert depth[-1] < depth[0] - 0.01  # the tips move back as they open
+    assert len(robot.homes_rad) >= 4 and not any(robot.collides_itself(q) for q in robot.homes_rad)
+
+
+def test_a_torso_is_held_where_the_file_says_so(make: Made) -> None:
+    with pytest.raises(InputError, match=r"robot\.toml: arm: 3 joints move: pan, tilt, roll; 4 to 9 may"):
+        robot_limits(make(more="[arm.held]\nlift = 0.3\nelbow = 0.1\n"))
+    held = make(folder="b", more="[arm.held]\nlift = 0.3\n")
+    robot = open_robot(held, None, robot_limits(held).base_height_m[0])  # pyright: ignore[reportOptionalSubscript]
+    assert robot.joint_names == ("pan", "tilt", "elbow", "roll")
+    assert robot.base_height_m == pytest.approx(1.15)
+
+
+def test_a_digest_depends_on_content_and_not_on_the_place(make: Made) -> None:
+    first, second = make(), make(folder="b")
+    assert robot_digest(first) == robot_digest(second)
+    turned = make(folder="c", urdf=('upper="1.5"', 'upper="1.4"'))
+    named = make(folder="d", more='[hand]\nname = "other"\n')
+    assert len({robot_digest(path) for path in (first, turned, named)}) == 3
+    digest = robot_digest(first)
+    assert digest is not None
+    remember(second, "robot", digest)
+    assert open_robot(f"robot@{digest}", None, 0.85).name == "robot"
+    with pytest.raises(InputError, match="but the run was made with robot"):
+        remember(turned, "robot", digest)
+    with pytest.raises(InputError, match="a file that was not named"):
+        robot_source(f"robot@{'0' * 64}")
+
+
+@pytest.mark.parametrize(
+    ("keys", "urdf", "more", "said"),
+    [
+        (('tip = "palm"', ""), ("", ""), "", r"robot\.toml: arm\.tip: is missing"),
+        (("urdf", "urfd"), ("", ""), "", r"robot\.toml: urdf: is missing|urfd: is no key"),
+        (("", ""), ("", ""), "[arm2]\n", r"arm2: is no key"),
+        (("[arm]", "[arm"), ("", ""), "", r"robot\.toml: is not TOML"),
+        (('"robot.urdf"', '"gone.urdf"'), ("", ""), "", r"gone\.urdf: cannot be read"),
+        (('"robot.urdf"', '"package:no_such_thing/a.urdf"'), ("", ""), "", r"no_such_thing is not installed"),
+        (('"robot.urdf"', '"package:numpy/../a.urdf"'), ("", ""), "", r"leaves its package"),
+        (('tip = "palm"', 'tip = "plam"'), ("", ""), "", r"link plam: is missing"),
+        (('"palm"', '"base"'), ("", ""), "", r"arm\.tip: no joint moves between base and base"),
+        ((ENDS, 'base = "palm"\ntip = "base"'), ("", ""), "", r"not below link palm"),
+        (("", ""), ('type="continuous"', 'type="floating"'), "", r"joint pan: is floating"),
+        (("", ""), (LIMIT.format(-1.5, 1.5), ""), "", r"tilt: has no limit"),
+        (("", ""), ('multiplier="-1"', 'multiplier="0"'), "", r"hand: .*middle of its TCP"),
+        (("", ""), ("", ""), "[hand.range]\nopen = [0.0, 0.01]\n", r"opens by [0-9.]+ mm: the hand"),
+        (("", ""), ("", ""), '[hand]\nfingers = ["gone"]\n', r"joint gone: is missing"),
+        (("", ""), ("", ""), '[hand.tcp]\nlink = "wrist"\n', r"hand\.tcp\.link: link wrist is not fixed"),
+        (("", ""), ("", ""), '[hand.tcp]\napproach = "y"\n', r"hand\.tcp: approach y and closing y"),
+        (("", ""), ("", ""), "[base]\nheight_m = 0.6\n", r"base\.height_m: is 0\.6 m, .* 0\.850 m"),
+        (("", ""), ("", ""), "[base]\nfootprint_m = [[1, 1], [-1, -1], [1, -1], [-1, 1]]\n", r"crosses"),
+        (("", ""), ("", ""), "[base]\nfootprint_m = [[1, 1], [2, 1], [2, 2]]\n", r"does not hold the mount"),
+        (("", ""), ("", ""), "[base]\nfootprint_m = [[1, 1], [2, 1]]\n", r"base\.footprint_m"),
+        (("", ""), ("", ""), "[base]\npedestal = true\nradius_m = 0.3\n", r"excludes"),
+        (('"base"\n', '"base"\ntucked = [[0.0, 0.0]]\n'), ("", ""), "", r"arm\.tucked: has rows of 2"),
+        (('"base"\n', '"base"\nignore = ["gone"]\n'), ("", ""), "", r"arm\.ignore: link gone"),
+        (('urdf =', 'reach_m = 0.5\nurdf ='), ("", ""), "", r"reach_m: is 0\.5 m, and the URDF's arm has"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_used_is_one_line_that_names_the_key(
+    make: Made,
+    keys: tuple[str, str],
+    urdf: tuple[str, str],
+    more: str,
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = make(keys, urdf, more=more)
+    with pytest.raises(InputError, match=said):
+        open_robot(path, None, robot_limits(path).base_height_m[0])  # pyright: ignore[reportOptionalSubscript]
+    assert cli.run(["robot", path]) == 2
+    captured = capsys.readouterr()
+    (line,) = captured.err.strip().splitlines()
+    assert line.startswith("error: ")
+
+
+def test_meshes_of_every_format_are_read_and_broken_ones_refused(make: Made, tmp_path: Path) -> None:
+    import trimesh
+
+    box = '<box size="0.35 0.06 0.06"/>'
+    mesh = trimesh.creation.box((0.35, 0.06, 0.06))
+    plain = open_robot(make(), None, 0.85)
+    for ending in ("obj", "stl", "glb", "dae"):
+        if ending == "dae":
+            pytest.importorskip("collada")
+        path = make(urdf=(box, f'<mesh filename="upper.{ending}"/>'), folder=ending)
+        mesh.export(Path(path).with_name(f"upper.{ending}"))
+        robot = open_robot(path, None, 0.85)
+        part, wanted = robot.link_parts_m[3][0], plain.link_parts_m[3][0]
+        np.testing.assert_allclose(np.sort(part, axis=0), np.sort(wanted, axis=0), atol=1e-6)
+    for name, content, said in (
+        ("gone.stl", None, "gone.stl: cannot be read"),
+        ("bad.dae", b"<COLLADA>", r"bad.dae: (is not a mesh|needs)"),
+        ("bad.glb", b"glTF" + bytes(40), "bad.glb: is not a mesh"),
+    ):
+        path = make(urdf=(box, f'<mesh filename="{name}"/>'), folder="broken")
+        if content is not None:
+            Path(path).with_name(name).write_bytes(content)
+        with pytest.raises(InputError, match=said):
+            robot_limits(path)
+        shutil.rmtree(tmp_path / "broken")
+    path = make(urdf=(box, '<mesh filename="large.stl"/>'), folder="large")
+    trimesh.creation.icosphere(subdivisions=8, radius=0.03).export(Path(path).with_name("large.stl"))
+    with pytest.raises(InputError, match=r"large\.stl: has [0-9,]+ faces.*500,000"):
+        robot_limits(path)
+
+
+def test_a_missing_visual_mesh_and_a_link_without_length_do_not_block(make: Made) -> None:
+    visual = '<visual><geometry><mesh filename="gone.dae"/></geometry></visual>'
+    path = make(urdf=('<link name="upper">', f'<link name="upper">{visual}'))
+    robot = open_robot(path, None, 0.85)
+    assert [len(m.faces) > 0 for m in robot.link_meshes()] == [bool(p) for p in robot.link_parts_m]
+    short = make(urdf=('"0.42 0 0"', '"0 0 0"'), folder="b")
+    assert open_robot(short, None, 0.85).reach_m < robot.reach_m
+
+
+@needs_robots
+@pytest.mark.parametrize("name", ["stretch3", "tiago-pro", "ur5", "pr2", "fetch", "panda"])
+def test_a_robot_is_printed_and_drawn(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from PIL import Image
+
+    out = tmp_path / "robot.png"
+    assert cli.run(["robot", name, "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith(f"robot {name}") and 15 <= len(printed.splitlines()) <= 32
+    with Image.open(out) as image:
+        pixels = np.asarray(image)
+    assert pixels.std() > 10
+
+
+@needs_robots
+def test_robots_that_only_their_own_joints_can_describe() -> None:
+    stretch = open_robot("stretch3", None, robot_limits("stretch3").base_height_m[0])  # pyright: ignore[reportOptionalSubscript]
+    assert stretch.presents == "turns" and stretch.joint_names[0] == "base_turn"
+    assert stretch.joint_names[2].count("+") == 3 and stretch.q_upper_rad[2] == pytest.approx(0.52)
+    q = np.zeros(6)
+    out = [stretch.T_base_tcp(np.array([0.0, 0.5, x, 0.0, 0.0, 0.0]))[:3, 3] for x in (0.0, 0.4)]
+    np.testing.assert_allclose(out[1] - out[0], (0.0, -0.4, 0.0), atol=1e-5)  # to its right
+    turned = stretch.T_base_tcp(q + (1.2, 0, 0, 0, 0, 0))[:3, 3]
+    assert np.hypot(*turned[:2]) == pytest.approx(np.hypot(*stretch.T_base_tcp(q)[:2, 3]))
+    pr2 = open_robot("pr2", None, robot_limits("pr2").base_height_m[0])  # pyright: ignore[reportOptionalSubscript]
+    assert pr2.gripper.max_opening_m == pytest.approx(0.09, abs=0.003)  # as its URDF states
+    tool = np.array([0.18, 0.0, 0.0])  # r_gripper_tool_frame
+    assert np.linalg.norm(pr2.assembly.hand.T_palm_tcp[:3, 3] - tool) < 0.01
+    tiago = open_robot("tiago-pro", None, robot_limits("tiago-pro").base_height_m[0])  # pyright: ignore[reportOptionalSubscript]
+    assert len(tiago.gripper.body_parts_m) == 7
