@@ -101,6 +101,8 @@ docs: venv
 	mv build/data-format.md docs/reference/data-format.md
 	$(BIN)/python -m scripts.specification_page > build/specification.md
 	mv build/specification.md docs/reference/specification.md
+	$(BIN)/python -m scripts.robots_page > build/robots.md
+	mv build/robots.md docs/reference/robots.md
 
 pictures: venv
 	$(BIN)/python -m scripts.pictures

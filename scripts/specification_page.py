@@ -24,6 +24,8 @@ Fields that are absent by default are commented out, with the values that they h
 
 """
 _RESERVED = {"label_source", "houses", "objects", "scenes_from", "engines"}
+# Set by the program, from the robot that is named.
+_DERIVED = {"arm.robot_digest", "arm.joints"}
 _LENGTH = {"≥": "0", "≤": "100"}  # the bounds of every length
 _LIMITS = ((Ge, "≥", "ge"), (Gt, ">", "gt"), (Le, "≤", "le"), (Lt, "<", "lt"))
 
@@ -42,7 +44,7 @@ def _write(
     """Add the model's values to `rows` and its sections to `tables`, commented out where `absent`."""
     mark = "# " if absent else ""
     for name, field in model.model_fields.items():
-        if not prefix and name in _RESERVED:
+        if (not prefix and name in _RESERVED) or f"{prefix}{name}" in _DERIVED:
             continue
         default: Any = field.get_default(call_default_factory=True)
         below = type(default) if isinstance(default, BaseModel) else _section_of(field.annotation)

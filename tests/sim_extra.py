@@ -8,6 +8,9 @@ from datagen.workers.extras import EXTRAS
 
 SIM_INSTALLED = not EXTRAS["sim"].missing()
 needs_sim = pytest.mark.skipif(not SIM_INSTALLED, reason="the extra `sim` is not installed")
+needs_robots = pytest.mark.skipif(
+    bool(EXTRAS["robots"].missing()), reason="the extra `robots` is not installed"
+)
 needs_pybullet = pytest.mark.skipif(
     bool(EXTRAS["pybullet"].missing()), reason="pybullet is not installed: no wheels from Python 3.12 on"
 )

@@ -92,8 +92,8 @@ def robot_rows(robot: Robot) -> Rows:
         ("reach", f"{robot.reach_m:.3f} m from {_point(robot.shoulder_m)}{origin(keys.reach_m)}"),
         ("hand", hand),
         ("fingers", f"{motion}, {100 * least_m:.1f} to {100 * gripper.max_opening_m:.1f} cm apart"),
-        ("pads", f"{1000 * gripper.pad_size_m[0]:.0f} x {1000 * gripper.pad_size_m[1]:.0f} mm, at depth "
-                 f"{1000 * depth[0]:+.0f} (closed) to {1000 * depth[1]:+.0f} mm{origin(keys.hand.pad_size_m)}"),
+        ("pads", f"{_mm(gripper.pad_size_m[0])} x {_mm(gripper.pad_size_m[1])} mm, at depth {_mm(depth[0])} "
+                 f"(closed) to {_mm(depth[1])} mm{origin(keys.hand.pad_size_m)}"),
         ("TCP", f"({x:.3f}, {y:.3f}, {z:.3f}) m in {names[0]}, approach {_axis(T[:3, 2])}, "
                 f"closing {_axis(T[:3, 1])}{origin(keys.hand.tcp)}"),
     ]  # fmt: skip
@@ -148,6 +148,10 @@ def _stretched(robot: Robot, q: F64) -> F64:
     T = frame_poses(robot.tree, some, tcp_only=True)[:, 0]
     order = np.argsort(np.abs(T[:, 1, 3]) - T[:, 0, 3])
     return next((some[k] for k in order if not robot.collides_itself(some[k])), some[order[0]])
+
+
+def _mm(length_m: float) -> str:
+    return f"{round(1000 * length_m)}"
 
 
 def _point(p: F64) -> str:

@@ -14,14 +14,15 @@ from datagen.cli import VERBS, build_app
 from tests.conftest import REPOSITORY
 
 PAGES = sorted([REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md")])
-_BLOCK = re.compile(r"^```(?:console)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_BLOCK = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _SYNTAX = re.compile(r"[\[\]]|\.\.\.")  # marks what may be left out or repeated
 _REAL = {"REAL": "", "$REAL": "", "$NEW": "", "$NEAR": "", "$TRIALS": "RUN"}
 
 
 def commands(page: Path) -> Iterator[list[str]]:
     """The words of each command in a page's blocks of shell lines, with numbers for placeholders."""
-    for block in _BLOCK.findall(page.read_text("utf-8")):
+    blocks = _BLOCK.findall(page.read_text("utf-8"))
+    for block in (text for language, text in blocks if language in ("", "console")):
         for line in re.sub(r" *\\\n(?:> )? *", " ", block).splitlines():
             found = re.match(r"(?:\$ |> )?(datagen [^#|>&]*)", line)
             if found and not re.search(r"  +[^#\s]", line):  # not a diagram with two columns

@@ -19,6 +19,7 @@ from datagen.schemas.specification import (
 )
 from scripts import data_format_page, specification_page
 from tests.conftest import REPOSITORY
+from tests.sim_extra import needs_robots, needs_sim
 
 SOURCES = {"houses": Source(kind="a", digest="1" * 64), "objects": Source(kind="b", digest="2" * 64)}
 
@@ -28,6 +29,16 @@ SOURCES = {"houses": Source(kind="a", digest="1" * 64), "objects": Source(kind="
 )
 def test_a_page_is_up_to_date(name: str, page: Callable[[], str]) -> None:
     assert (REPOSITORY / f"docs/reference/{name}.md").read_text("utf-8") == page(), "run `make docs`"
+
+
+@needs_sim
+@needs_robots
+def test_the_page_of_robots_is_up_to_date() -> None:
+    from scripts import robots_page
+
+    assert (REPOSITORY / "docs/reference/robots.md").read_text("utf-8") == robots_page.page(), (
+        "run `make docs`"
+    )
 
 
 def test_every_field_has_a_unit_or_is_a_name_and_says_what_it_means() -> None:
@@ -47,5 +58,5 @@ def test_the_example_of_a_specification_has_the_defaults_also_where_it_comments_
     fields = tomllib.loads(re.sub(r"^# ", "", example[1], flags=re.MULTILINE))
     spec = Specification.model_validate(SOURCES | fields)
     assert spec.arm == ArmParams(trial=TrialParams(), disturbance=DisturbanceParams())
-    assert set(fields["arm"]) == set(ArmParams.model_fields)
+    assert set(fields["arm"]) == set(ArmParams.model_fields) - {"robot_digest", "joints"}
     assert spec.candidates == CandidateParams(within="clear", scaled_base=True)

@@ -101,9 +101,11 @@ def read_trees(source: RobotSource) -> tuple[UrdfTree, UrdfTree]:
     hand = tree
     if keys.hand.urdf is not None:
         hand = read_urdf(resource(keys.hand.urdf, folder, source.path, "hand.urdf"))
+    source.refuse_unknown("arm.base", keys.arm.base, tree.links)
+    source.refuse_unknown("arm.tip", keys.arm.tip, tree.links)
+    source.refuse_unknown("hand.palm", keys.hand.palm or next(iter(hand.links)), hand.links)
     for name in keys.arm.ignore:
-        if name not in tree.links and name not in hand.links:
-            raise source.wrong("arm.ignore", f"link {name} is not in the URDF")
+        source.refuse_unknown("arm.ignore", name, [*tree.links, *hand.links])
     bare = [without_shapes(t, [name for name in keys.arm.ignore if name in t.links]) for t in (tree, hand)]
     return bare[0], bare[0] if hand is tree else bare[1]
 

@@ -86,7 +86,9 @@ def base_of(source: RobotSource, body: LinkBody, joints: tuple[Joint, ...], turn
     if outline is not None:
         ring = np.array(outline)
         if not inside_polygon(np.zeros((1, 2)), ring)[0]:
-            raise wrong("base.footprint_m", "does not hold the mount, its origin", "Correct it, or base.mount_m")
+            raise wrong(
+                "base.footprint_m", "does not hold the mount, its origin", "Correct it, or base.mount_m"
+            )
     deck: F32 | None = None
     if not is_in_urdf and height_m > 2 * _GAP_M:
         levels = (-height_m, min(lowest_m, 0.0) - _GAP_M)

@@ -86,8 +86,11 @@ class HandMeasures:
         side = dict(zip(roots, np.sign(along).astype(int).tolist(), strict=True))
         self.side: Ints = np.array([side.get(r, 0) for r in fingers.root.tolist()])
         if set(self.side[1:].tolist()) - {0} != {1, -1}:
-            fix = "Name the joints of two fingers"
-            raise self._wrong("hand.fingers", "the fingers do not lie on both sides of the hand", fix)
+            fix = "Use a hand of two fingers that both move, or name their joints"
+            problem = (
+                "only one finger moves" if len(roots) == 1 else "no fingers lie on both sides of the hand"
+            )
+            raise self._wrong("hand.fingers", problem, fix)
         self._faces = [[ConvexHull(part).equations for part in parts] for parts in fingers.parts_m]
 
     def _has_shapes(self, root: int) -> bool:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections.abc import Iterable
+from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -171,6 +173,13 @@ class RobotSource:
     def wrong(self, field: str, problem: str, fix: str = "Correct the value") -> InputError:
         """The error for a key of this file."""
         return InputError(self.path, field, problem, fix)
+
+    def refuse_unknown(self, field: str, link: str, links: Iterable[str]) -> None:
+        """Raise InputError where a key names a link that is not among those of a URDF."""
+        links = list(links)
+        if link not in links:
+            near = get_close_matches(link, links, n=3, cutoff=0.3) or links[:3]
+            raise self.wrong(field, f"link {link} is not in the URDF", f"Did you mean {' or '.join(near)}?")
 
 
 def read_robot(path: Path) -> RobotSource:

@@ -10,13 +10,13 @@ import pytest
 from datagen.workers.extras import EXTRAS
 from datagen.workers.robots import ROBOTS, open_robot, robot_limits, robot_source
 from datagen.workers.robots.robot import Robot
+from tests.sim_extra import needs_robots
 
 Case = tuple[str, float | None, float]
 
 _SHARES_OF_REACH = (0.0, 0.1, 0.3, 0.65, 1.0)  # shares of the range of a robot that is scaled
 _ON_PEDESTAL_M = 0.8
 _MISSING = EXTRAS["robots"].missing()
-needs_robots = pytest.mark.skipif(bool(_MISSING), reason="the extra `robots` is not installed")
 
 
 def cases_of(name: str) -> list[Case]:

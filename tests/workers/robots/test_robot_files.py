@@ -20,7 +20,7 @@ from datagen.workers.robots import (
     robot_limits,
     robot_source,
 )
-from tests.workers.robots.robots_under_test import needs_robots
+from tests.sim_extra import needs_robots
 
 # A 5-joint arm of plain solids on a box, with a hand of two fingers that pivot.
 LINKS = {
@@ -141,7 +141,7 @@ def test_a_digest_depends_on_content_and_not_on_the_place(make: Made) -> None:
         (('"robot.urdf"', '"gone.urdf"'), ("", ""), "", r"gone\.urdf: cannot be read"),
         (('"robot.urdf"', '"package:no_such_thing/a.urdf"'), ("", ""), "", r"no_such_thing is not installed"),
         (('"robot.urdf"', '"package:numpy/../a.urdf"'), ("", ""), "", r"leaves its package"),
-        (('tip = "palm"', 'tip = "plam"'), ("", ""), "", r"link plam: is missing"),
+        (('tip = "palm"', 'tip = "plam"'), ("", ""), "", r"tip: link plam is not .* Did you mean palm"),
         (('"palm"', '"base"'), ("", ""), "", r"arm\.tip: no joint moves between base and base"),
         ((ENDS, 'base = "palm"\ntip = "base"'), ("", ""), "", r"not below link palm"),
         (("", ""), ('type="continuous"', 'type="floating"'), "", r"joint pan: is floating"),
