@@ -9,7 +9,7 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import F64, Bools
-from datagen.workers.geometry.planar import inside_polygon
+from datagen.workers.geometry.planar import crosses_itself, inside_polygon
 from datagen.workers.robots import ROBOTS, robot_limits
 
 _SMALLEST_M, _LARGEST_M = 0.02, 2.0  # limits of a base, from the mount's axis
@@ -116,26 +116,10 @@ def polygon_footprint(corners_m: Sequence[Sequence[float]], place: str = "--foot
     if not (np.isfinite(corners).all() and far_m <= _LARGEST_M):
         raise InputError(place, "", f"has a corner farther than {_LARGEST_M:g} m", _FIX)
     wide_m = corners.max(axis=0) - corners.min(axis=0)
-    if wide_m.min() < 2 * _SMALLEST_M or _crosses_itself(corners):
+    if wide_m.min() < 2 * _SMALLEST_M or crosses_itself(corners):
         raise InputError(place, "", "crosses itself or has no area", _FIX)
     if not inside_polygon(np.zeros((1, 2)), corners)[0]:
         fix = "Give corners around the arm's mount: its axis is the origin, x to the front"
         raise InputError(place, "", "does not hold the arm's mount", fix)
     radius_m = float(np.linalg.norm(corners, axis=1).max())
     return Footprint(radius_m, tuple((x, y) for x, y in corners.tolist()))
-
-
-def _crosses_itself(corners: F64) -> bool:
-    """Whether a corner is repeated or two sides cross."""
-    ends = np.roll(corners, -1, axis=0)
-    if (np.linalg.norm(ends - corners, axis=1) < 1e-6).any():
-        return True
-    along = (ends - corners)[:, None]
-
-    def side(points: F64) -> F64:
-        """Side (K, K) of each edge's line on which points (K, 2) are: 1 left, -1 right, 0 on it."""
-        rel = points[None] - corners[:, None]
-        return np.sign(along[..., 0] * rel[..., 1] - along[..., 1] * rel[..., 0])
-
-    parts = side(corners) * side(ends) < 0
-    return bool((parts & parts.T).any())

@@ -90,3 +90,19 @@ def inside_any(points_m: F64, polygons_m: Sequence[F64]) -> npt.NDArray[np.bool_
     for polygon_m in polygons_m:
         inside |= inside_polygon(points_m, polygon_m)
     return inside
+
+
+def crosses_itself(corners: F64) -> bool:
+    """Whether a corner is repeated or two sides cross."""
+    ends = np.roll(corners, -1, axis=0)
+    if (np.linalg.norm(ends - corners, axis=1) < 1e-6).any():
+        return True
+    along = (ends - corners)[:, None]
+
+    def side(points: F64) -> F64:
+        """Side (K, K) of each edge's line on which points (K, 2) are: 1 left, -1 right, 0 on it."""
+        rel = points[None] - corners[:, None]
+        return np.sign(along[..., 0] * rel[..., 1] - along[..., 1] * rel[..., 0])
+
+    parts = side(corners) * side(ends) < 0
+    return bool((parts & parts.T).any())

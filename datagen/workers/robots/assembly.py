@@ -26,7 +26,7 @@ from datagen.workers.robots.links import (
 from datagen.workers.robots.reach import Chain, farthest_m, largest_reach_m
 from datagen.workers.robots.resources import resource
 from datagen.workers.robots.robot_file import RobotSource, ScaleKeys
-from datagen.workers.robots.urdf import FIX, Joint, UrdfTree, read_urdf, rpy_rotation
+from datagen.workers.robots.urdf import FIX, Joint, Link, UrdfTree, read_urdf, rpy_rotation
 
 _TUBE_SIDES = 12
 _REACH_TOLERANCE_M = 1e-6
@@ -221,29 +221,25 @@ class _ArmChain:
             raise source.wrong(
                 "arm.tip", f"no joint moves between {keys.arm.base} and {keys.arm.tip}", "Correct it"
             )
-        above = tree.joint_above(palm) if keys.hand.urdf is None and palm != keys.arm.tip else None
-        stops = {*(joint.name for joint in self._joints), *([above.name] if above else [])}
-        heads = [keys.arm.base, *(joint.child for joint in self._joints)]
+        self.names = [keys.arm.base, *(joint.child for joint in self._joints)]
+        stops = {joint.name for joint in self._joints}
+        own_hand = keys.hand.urdf is None
+        above = tree.joint_above(palm) if own_hand and palm not in self.names else None
+        stops |= {above.name} if above else set()
         x, y = keys.base.mount_m or (0.0, 0.0)
-        T_heads: list[F64 | None] = [
-            translation(-x, -y, 0.0) if self.turns else None,
-            *[None] * len(self._joints),
-        ]
+        T_head = translation(-x, -y, 0.0) if self.turns else None  # a base that turns about its mount
         self.clusters = [
-            cluster_of(tree, head, stops, keys.arm.held, T) for head, T in zip(heads, T_heads, strict=True)
+            cluster_of(tree, head, stops, keys.arm.held, None if k else T_head)
+            for k, head in enumerate(self.names)
         ]
-        self.names = heads
-        if palm in self.clusters[-1] and keys.hand.urdf is None:
-            # The hand begins at the last joint: its bodies hold those links.
-            bare = self.clusters[-1][keys.arm.tip][0]
-            self.clusters[-1] = {
-                keys.arm.tip: (
-                    replace(bare, collisions=(), visuals=(), inertial=None),
-                    self.clusters[-1][keys.arm.tip][1],
-                )
-            }
-            self.names = [*heads[:-1], f"{heads[-1]}-tip"] if heads[-1] == palm else heads
-        self.T_tip = self.clusters[-1][keys.arm.tip][1]
+        last = self.clusters[-1]
+        if own_hand and palm == self.names[-1]:  # the hand's bodies hold what the last joint moves
+            self.clusters[-1] = last = {palm: (Link(palm, None, (), ()), np.eye(4))}
+            self.names[-1] += "-tip"
+        at_palm = above is not None and palm == keys.arm.tip
+        self.T_tip = (
+            last[above.parent][1] @ above.T_parent_child if at_palm and above else last[keys.arm.tip][1]
+        )
         self.T_tip_palm = self._tip_palm(source, palm)
         self._coordinates(source)
 

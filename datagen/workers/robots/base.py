@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.geometry.planar import inside_polygon
+from datagen.workers.geometry.planar import crosses_itself, inside_polygon
 from datagen.workers.geometry.transforms import translation
 from datagen.workers.robots.links import LinkBody
 from datagen.workers.robots.robot_file import BaseKeys, RobotSource
@@ -17,6 +17,7 @@ from datagen.workers.robots.urdf import Joint
 # A URDF whose links reach at least so far below the first joint that turns has a base of its own; the foot of
 # an arm is smaller than this area and than this share of the base that it stands on.
 _OWN_BASE_M, _LEAST_M2, _SHARE = 0.45, 0.05, 0.3
+_LEAST_BASE_M2 = 1e-3
 _WRONG_HEIGHT_M, _UNEVEN_M = 0.03, 0.02
 _GAP_M = 0.005  # between a base that no URDF has and the arm on it
 _CORNERS = 24
@@ -63,10 +64,12 @@ def base_of(source: RobotSource, body: LinkBody, joints: tuple[Joint, ...], turn
         ring = radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     else:
         ring = np.zeros((0, 2)) if outline is None else np.array(outline)
-    if len(ring) and not _is_simple(ring):
+    x, y = ring.T
+    ring_m2 = float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
+    if len(ring) and (crosses_itself(ring) or ring_m2 < _LEAST_BASE_M2):
         raise wrong("base.footprint_m", "crosses itself or has no area", "Give the corners in order")
     area_m2 = ConvexHull(points[:, :2]).volume if len(points) > 2 else 0.0
-    is_in_urdf = area_m2 > (_SHARE * ConvexHull(ring).volume if len(ring) else _LEAST_M2)
+    is_in_urdf = area_m2 > (_SHARE * ring_m2 if len(ring) else _LEAST_M2)
     mount_m = shoulder_m if is_in_urdf else np.zeros(3)
     if keys.mount_m is not None or turns:
         mount_m[:2] = keys.mount_m or (0.0, 0.0)
@@ -114,19 +117,3 @@ def _outline(flat: F64) -> Outline:
         )
     rounded = np.sign(hull) * np.ceil(np.abs(hull) * 1000 - 1e-6) / 1000
     return tuple((float(x), float(y)) for x, y in rounded)
-
-
-def _is_simple(corners: F64) -> bool:
-    ends = np.roll(corners, -1, axis=0)
-    area = np.sum(corners[:, 0] * ends[:, 1] - corners[:, 1] * ends[:, 0])
-    n = len(corners)
-
-    def side(p: F64, q: F64, r: F64) -> float:
-        return float(np.sign((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])))
-
-    for i in range(n):
-        for j in range(i + 2, n - (i == 0)):
-            a, b, c, d = corners[i], ends[i], corners[j], ends[j]
-            if side(a, b, c) != side(a, b, d) and side(c, d, a) != side(c, d, b):
-                return False
-    return bool(abs(area) > 1e-4)

@@ -224,6 +224,23 @@ def separation(one: np.ndarray, two: np.ndarray) -> float:
     return float(-result.fun) if -result.fun > 1e-9 else 0.0
 
 
+def test_no_collision_shape_of_the_urdf_is_lost(robot: Robot) -> None:
+    """Every shape below the arm's base is a part of a body, but for those of a replaced hand."""
+    tree, hand = read_trees(robot.source)
+    keys = robot.source.keys
+
+    def shapes(of: Any, link: str) -> int:
+        cuts = len(keys.arm.cuts_m.get(link, ()))
+        own = sum(1 + (cuts if shape.mesh else 0) for shape in of.link(link).collisions)
+        return own + sum(shapes(of, joint.child) for joint in of.children(link))
+
+    wanted = shapes(tree, keys.arm.base)
+    if hand is not tree:
+        wanted += shapes(hand, keys.hand.palm)
+    extra = (robot.base.deck_m is not None) + (robot.reach_m < 0.5)  # a deck; the scaled family's tube
+    assert sum(map(len, robot.link_parts_m)) == wanted + extra
+
+
 def test_the_tree_is_where_pinocchio_puts_the_links_of_the_urdf(robot: Robot) -> None:
     """pinocchio's own reading of the file, every joint set by name; scaled arms have no such file."""
     if robot.scale != 1.0 or robot.source.keys.scaled:

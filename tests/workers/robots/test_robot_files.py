@@ -155,6 +155,7 @@ def test_a_digest_depends_on_content_and_not_on_the_place(make: Made) -> None:
         (("", ""), ("", ""), "[base]\nfootprint_m = [[1, 1], [-1, -1], [1, -1], [-1, 1]]\n", r"crosses"),
         (("", ""), ("", ""), "[base]\nfootprint_m = [[1, 1], [2, 1], [2, 2]]\n", r"does not hold the mount"),
         (("", ""), ("", ""), "[base]\nfootprint_m = [[1, 1], [2, 1]]\n", r"base\.footprint_m"),
+        (("", ""), ("", ""), "[base]\nfootprint_m = [[-1, 0], [0, 0], [1, 0]]\n", r"has no area"),
         (("", ""), ("", ""), "[base]\npedestal = true\nradius_m = 0.3\n", r"excludes"),
         (('"base"\n', '"base"\ntucked = [[0.0, 0.0]]\n'), ("", ""), "", r"arm\.tucked: has rows of 2"),
         (('"base"\n', '"base"\nignore = ["gone"]\n'), ("", ""), "", r"arm\.ignore: link gone"),
