@@ -107,7 +107,8 @@ class SubmitOptions(JobOptions):
     robot: Annotated[
         str | None,
         option(
-            "Name of a robot, or its file ROBOT.toml; sets reach and height. "
+            "fetch, panda, panda-scaled, pr2, stretch3, tiago-pro, ur5, xarm7, or a file ROBOT.toml; sets "
+            "reach and height. "
             "[default: any for heuristic, panda-scaled for plan and sim]",
             ROBOT,
         ),

@@ -221,7 +221,8 @@ def complete_arm(
     named = robot or arm.get("robot", ArmParams().robot)
     if isinstance(named, str):
         is_known = robot is None and "robot_digest" in arm
-        put_robot(arm, f"{named}@{arm['robot_digest']}" if is_known else named)
+        key = f"{named}@{arm['robot_digest']}" if is_known else named
+        put_robot(arm, key, f"{place}: arm.robot" if robot is None else "--robot")
     if label_source == "sim":
         arm.setdefault("trial", {})
     if repeats is not None:
@@ -230,9 +231,10 @@ def complete_arm(
             disturbance["repeats"] = repeats
 
 
-def put_robot(arm: Fields, name: str) -> None:
+def put_robot(arm: Fields, name: str, option: str = "--robot") -> None:
     """Set the robot of the section `arm`, and what labels depend on. InputError for an unknown one."""
-    source, digest = robot_source(name), robot_digest(name)
+    source = robot_source(name, option)
+    digest = robot_digest(name)
     if digest is not None:
         remember(name, source.name, digest)
     count = coordinates_of(name)

@@ -113,10 +113,11 @@ def _any_of(name: str) -> Robot:
     return open_robot(name, limits.reach_m[1], height_m)
 
 
-def robot_source(name: str) -> RobotSource:
+def robot_source(name: str, option: str = "--robot") -> RobotSource:
     """The file of a robot: of the registry, or at a path that ends with .toml, or that this process has read.
 
-    The last are named `name@digest`, as a specification does. Raises InputError for an unknown one.
+    The last are named `name@digest`, as a specification does. Raises InputError naming the option for an
+    unknown one.
     """
     if name in ROBOTS:
         return read_robot(Path(__file__).parent / ROBOTS[name])
@@ -130,9 +131,8 @@ def robot_source(name: str) -> RobotSource:
             return remember(plain, plain, digest)
         fix = "Give --robot with the robot's file"
         raise InputError("--robot", plain, "is a robot from a file that was not named", fix)
-    raise InputError(
-        "--robot", name or "''", "is unknown", f"{choices(ROBOTS, name)}, or give a file: ROBOT.toml"
-    )
+    fix = f"{choices(ROBOTS, name)}, or give a file: ROBOT.toml"
+    raise InputError(option, name or "''", "is unknown", fix)
 
 
 _read: dict[str, RobotSource] = {}

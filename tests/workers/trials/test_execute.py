@@ -13,12 +13,13 @@ from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import translation, yaw_pose
 from datagen.workers.motion import MotionPlan
-from datagen.workers.robots import open_robot
+from datagen.workers.robots import open_robot, robot_limits
 from datagen.workers.scenes import SettledScene
 from datagen.workers.trials import Disturbance, TrialResult
 from datagen.workers.trials.execute import run_trial
 from datagen.workers.trials.physics import TrialWorld
 from datagen.workers.trials.trial_scene import prepare_trials
+from tests.sim_extra import needs_robots
 from tests.workers.trials.worlds import base_before, on_top_m, plan_from_above, scene_with
 from tests.workers.worlds import TABLE_TOP_M, box_body, box_model
 
@@ -199,10 +200,19 @@ def test_poses_that_are_no_poses_are_unstable_and_no_exception(place: str) -> No
 
 @pytest.mark.parametrize(
     ("name", "reach_m", "distance_m"),
-    [("panda", None, 0.4), ("xarm7", None, 0.4), ("fetch", None, 0.4), ("panda-scaled", 0.45, 0.2)],
+    [
+        ("panda", None, 0.4),
+        ("xarm7", None, 0.4),
+        ("fetch", None, 0.5),
+        ("panda-scaled", 0.45, 0.2),
+        pytest.param("ur5", None, 0.45, marks=needs_robots),
+        pytest.param("tiago-pro", None, 0.4, marks=needs_robots),
+        pytest.param("pr2", None, 0.4, marks=needs_robots),
+        pytest.param("stretch3", None, 0.4, marks=needs_robots),
+    ],
 )
 def test_every_robot_lifts_a_box(name: str, reach_m: float | None, distance_m: float) -> None:
-    robot = open_robot(name, reach_m, 0.8)
+    robot = open_robot(name, reach_m, (robot_limits(name).base_height_m or (0.8,))[0])
     scene = scene_with([box_model("target", (0.05, 0.05, 0.12))], [(-0.45, 0.0)])
     base = base_before(robot, 0.45 + distance_m)
     plan = plan_from_above(robot, base, on_top_m(scene, 0.03), 0.08)

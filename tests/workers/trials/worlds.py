@@ -39,8 +39,11 @@ def base_before(robot: Robot, distance_m: float) -> F64:
 def plan_from_above(robot: Robot, T_world_base: F64, grasp_m: F64, opening_m: float) -> MotionPlan:
     """A plan that grasps at a world position (3,) from above."""
     T_grasp = inverse(T_world_base) @ translation(*grasp_m) @ DOWN
-    for k, home in enumerate(robot.homes_rad):
-        q_grasp = robot.ik(T_grasp, home)
+    homes, low, high = robot.homes_rad, robot.q_lower_rad, robot.q_upper_rad
+    others = np.random.default_rng(0).uniform(low, high, (40, len(low)))
+    for k, seed in enumerate([*homes, *others]):
+        k = k % len(homes)
+        home, q_grasp = homes[k], robot.ik(T_grasp, seed)
         if q_grasp is None:
             continue
         down, up = (
