@@ -94,7 +94,7 @@ class PredictOptions:
         camera_height: Height of the frame's camera (m), where it has no pose.
         gravity: Direction of gravity x,y,z in the camera frame (x right, y down).
         robot_camera_height: Height of the robot's own camera (m). [default: that of the frame's camera]
-        footprint: Base: radius (m), corners x,y;x,y;... around the mount, x ahead, or a robot.
+        footprint: Base: radius (m), corners x,y;x,y;... around the mount, x ahead; or a robot.
             [default: as trained]
         depth_scale: Metres per step of 16-bit depth.
         allow_unseen: Also consider cells of which the floor, or the way there, was not seen.

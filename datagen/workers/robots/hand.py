@@ -32,6 +32,7 @@ def hand_of(source: RobotSource, tree: UrdfTree, palm: str) -> Hand:
     """The hand below a link of a URDF. Raises InputError naming the link or joint and what to change."""
     keys, held = source.keys.hand, source.keys.arm.held
     joints = _moving(source, tree, palm)
+    known = {joint.name for joint in joints}
     clusters, bodies = dict[str, Cluster](), dict[str, LinkBody]()
     for name in (palm, *(joint.child for joint in joints)):
         clusters[name] = cluster_of(tree, name, {joint.name for joint in joints}, held)
@@ -43,6 +44,10 @@ def hand_of(source: RobotSource, tree: UrdfTree, palm: str) -> Hand:
         if not bodies[joint.child].parts_m and joint.child not in carried.values():
             joints.remove(joint)
             del bodies[joint.child], carried[joint.child]
+    if not joints:
+        raise source.wrong(
+            "hand", f"no link that moves below {palm} has a shape", "Name the palm in hand.palm"
+        )
     names = list(bodies)
     parents = [names.index(carried[joint.child]) for joint in joints]
     joints = [
@@ -53,7 +58,7 @@ def hand_of(source: RobotSource, tree: UrdfTree, palm: str) -> Hand:
     ]
     T_tcp = _given_tcp(source, clusters[palm])
     parts_m = [body.parts_m for body in bodies.values()]
-    tree_of = _Opening(source, tree, joints, parents)
+    tree_of = _Opening(source, tree, joints, parents, known)
     fingers = tree_of.opened(parts_m, None if T_tcp is None else T_tcp[:3, 1])
     measures = HandMeasures(source, fingers, T_tcp)
     gripper = measures.gripper(keys.name or palm, keys.pad_size_m)
@@ -104,14 +109,18 @@ class _Opening:
     """Joints of a hand as they follow one coordinate from 0, closed, to 1, open."""
 
     def __init__(
-        self, source: RobotSource, tree: UrdfTree, joints: Sequence[Joint], parents: Sequence[int]
+        self,
+        source: RobotSource,
+        tree: UrdfTree,
+        joints: Sequence[Joint],
+        parents: Sequence[int],
+        known: set[str],
     ) -> None:
         self._tree, self._joints, self._parents = tree, joints, parents
         self._given, self._ends = source.keys.hand.range, dict[str, tuple[float, float]]()
-        names = {joint.name for joint in joints}
         for joint in joints:
             driver = tree.driver(joint)[0]
-            if driver.name not in names:
+            if driver.name not in known:
                 problem = f"joint {joint.name} mimics {driver.name}, which is not below the palm"
                 raise source.wrong("hand.palm", problem, "Name a link above both")
             try:
