@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,36 @@ class KinematicTree(NamedTuple):
     upper: F64  # (A,)
     frame_joint: Ints  # (F,), the joint that carries each frame; -1 is the base
     T_joint_frame: F64  # (F, 4, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """Positions of a model's joints (J,) from the coordinates (A,): matrix @ q + offset."""
+
+    matrix: F64  # (J, A)
+    offset: F64  # (J,)
+    lower: F64  # (A,)
+    upper: F64  # (A,)
+    are_joints: bool  # each joint has a coordinate of its own, in order
+
+    @staticmethod
+    def of(tree: KinematicTree) -> Coordinates:
+        """Those of a tree."""
+        matrix = np.zeros((len(tree.ratio), len(tree.lower)))
+        matrix[np.arange(len(tree.ratio)), tree.coordinate] = tree.ratio
+        plain = matrix.shape[0] == matrix.shape[1] and bool((matrix == np.eye(len(matrix))).all())
+        return Coordinates(matrix, tree.offset, tree.lower, tree.upper, plain and not tree.offset.any())
+
+    def __call__(self, q: F64) -> F64:
+        return q if self.are_joints else self.matrix @ q + self.offset
+
+    def of_joints(self, positions: F64) -> F64:
+        """Coordinates (A,) of positions (J,), means where joints share one."""
+        if self.are_joints:
+            return positions
+        weights = np.abs(self.matrix)
+        shares = np.divide(positions - self.offset, self.matrix.sum(axis=1))
+        return shares @ weights / weights.sum(axis=0)
 
 
 def frame_poses(tree: KinematicTree, q: F64, tcp_only: bool = False) -> F64:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
-from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.hulls import shape_parts
 from datagen.workers.robots.kinematic_tree import joint_motion
-from datagen.workers.robots.urdf import FIX, Inertial, Joint, Link, Shape, UrdfTree, scaled_inertial
+from datagen.workers.robots.urdf import Inertial, Joint, Link, Shape, UrdfTree, scaled_inertial
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +118,3 @@ def _combined(inertials: list[tuple[Inertial, F64]]) -> Inertial | None:
         R = T[:3, :3]
         inertia += R @ i.inertia_kgm2 @ R.T + i.mass_kg * (d @ d * np.eye(3) - np.outer(d, d))
     return Inertial(mass, centre, inertia)
-
-
-def wrong_urdf(path: Path, field: str, problem: str, fix: str = FIX) -> InputError:
-    """The error for an element of a URDF."""
-    return InputError(path, field, problem, fix)

@@ -178,7 +178,7 @@ class RobotSource:
         """Raise InputError where a key names a link that is not among those of a URDF."""
         links = list(links)
         if link not in links:
-            near = get_close_matches(link, links, n=3, cutoff=0.3) or links[:3]
+            near = get_close_matches(link, links, n=3, cutoff=0.3) or links[:3] or ["none"]
             raise self.wrong(field, f"link {link} is not in the URDF", f"Did you mean {' or '.join(near)}?")
 
 

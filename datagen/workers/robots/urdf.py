@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -141,12 +140,6 @@ class UrdfTree:
         if joint.kind == "prismatic":
             return joint.lower, joint.upper
         return max(joint.lower, -2 * np.pi), min(joint.upper, 2 * np.pi)
-
-
-@lru_cache(maxsize=16)
-def read_urdf_once(path: Path, _stamp: tuple[int, int]) -> UrdfTree:
-    """`read_urdf` of a file by its time and size."""
-    return read_urdf(path)
 
 
 def read_urdf(path: Path) -> UrdfTree:

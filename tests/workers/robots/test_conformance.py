@@ -14,7 +14,8 @@ pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run 
 from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.robots import robot_limits
-from datagen.workers.robots.assembly import FEWEST, MOST, TURN, read_trees
+from datagen.workers.robots.arm_chain import FEWEST, MOST, TURN
+from datagen.workers.robots.assembly import read_trees
 from datagen.workers.robots.hulls import MAX_CORNERS, polyhedron
 from datagen.workers.robots.kinematic_tree import frame_poses
 from datagen.workers.robots.links import position_of

@@ -20,6 +20,7 @@ from datagen.workers.robots import (
     robot_limits,
     robot_source,
 )
+from datagen.workers.robots.urdf import read_urdf
 from tests.sim_extra import needs_robots
 
 # A 5-joint arm of plain solids on a box, with a hand of two fingers that pivot.
@@ -104,6 +105,37 @@ def test_everything_is_derived_from_a_file_of_five_lines(make: Made) -> None:
     depth = robot.gripper.linkage.depth_m
     assert depth[-1] < depth[0] - 0.01  # the tips move back as they open
     assert len(robot.homes_rad) >= 4 and not any(robot.collides_itself(q) for q in robot.homes_rad)
+
+
+def test_python_and_predict_accept_a_file_wherever_a_name_is(make: Made) -> None:
+    pytest.importorskip("torch")
+    import datagen
+    from datagen.train.prediction import read_footprint
+
+    path = make()
+    corners = datagen.robots[path].footprint_m
+    assert corners is not None
+    assert read_footprint(path).corners_m == read_footprint([list(corner) for corner in corners]).corners_m
+    with pytest.raises(InputError, match=r"gone\.toml: cannot be read"):
+        read_footprint("gone.toml")
+
+
+def test_a_mimic_of_a_mimic_follows_the_driver(tmp_path: Path) -> None:
+    chain = (
+        '<joint name="{}" type="revolute"><parent link="{}"/><child link="{}"/><axis xyz="0 0 1"/>'
+        '<limit lower="-1" upper="1" velocity="1" effort="1"/>{}</joint>'
+    )
+    mimics = (
+        "",
+        '<mimic joint="a" multiplier="2" offset="0.5"/>',
+        '<mimic joint="b" multiplier="-3" offset="1"/>',
+    )
+    joints = "".join(chain.format(n, k, k + 1, m) for k, (n, m) in enumerate(zip("abc", mimics, strict=True)))
+    file = tmp_path / "a.urdf"
+    file.write_text(f"<robot>{''.join(f'<link name="{k}"/>' for k in range(4))}{joints}</robot>")
+    tree = read_urdf(file)
+    joint, ratio, offset = tree.driver(tree.joint("c"))
+    assert (joint.name, ratio, offset) == ("a", -6.0, -0.5)  # c = 1 - 3 b, b = 0.5 + 2 a
 
 
 def test_a_torso_is_held_where_the_file_says_so(make: Made) -> None:
