@@ -125,14 +125,12 @@ def test_a_mimic_of_a_mimic_follows_the_driver(tmp_path: Path) -> None:
         '<joint name="{}" type="revolute"><parent link="{}"/><child link="{}"/><axis xyz="0 0 1"/>'
         '<limit lower="-1" upper="1" velocity="1" effort="1"/>{}</joint>'
     )
-    mimics = (
-        "",
-        '<mimic joint="a" multiplier="2" offset="0.5"/>',
-        '<mimic joint="b" multiplier="-3" offset="1"/>',
-    )
-    joints = "".join(chain.format(n, k, k + 1, m) for k, (n, m) in enumerate(zip("abc", mimics, strict=True)))
+    mimic = '<mimic joint="{}" multiplier="{}" offset="{}"/>'
+    mimics = ("", mimic.format("a", 2, 0.5), mimic.format("b", -3, 1))
+    links = "".join(f"<link name='{k}'/>" for k in range(4))
+    joints = "".join(chain.format("abc"[k], k, k + 1, mimics[k]) for k in range(3))
     file = tmp_path / "a.urdf"
-    file.write_text(f"<robot>{''.join(f'<link name="{k}"/>' for k in range(4))}{joints}</robot>")
+    file.write_text(f"<robot>{links}{joints}</robot>")
     tree = read_urdf(file)
     joint, ratio, offset = tree.driver(tree.joint("c"))
     assert (joint.name, ratio, offset) == ("a", -6.0, -0.5)  # c = 1 - 3 b, b = 0.5 + 2 a
