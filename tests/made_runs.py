@@ -24,7 +24,7 @@ from datagen.schemas.run_records import (
     QuarantineRecord,
 )
 from datagen.schemas.shard_files import encode_shard, zipped
-from datagen.schemas.shard_sources import ZipFiles
+from datagen.schemas.shard_reading import ZipFiles
 from datagen.schemas.specification import ObservationParams, SceneParams, Source, Specification
 from datagen.schemas.storage import open_storage
 

@@ -106,7 +106,7 @@ def arrays_of(schema: RecordSchema, layout: Layout) -> Mapping[str, StoredArray]
 def decode_chunk(place: str, array: StoredArray, data: bytes) -> Array:
     """Decode a chunk's values, (chunk_rows, ...). InputError naming `place` for damaged bytes."""
     packed = data[:-4]
-    if len(data) < 5 or google_crc32c.value(packed) != int.from_bytes(data[-4:], "little"):
+    if len(data) < 5 or not has_crc32c(data):
         raise InputError(place, array.name, "the crc32c does not match: the file is damaged", DAMAGE_FIX)
     shape = (array.chunk_rows, *array.shape[1:])
     count = math.prod(shape)
@@ -127,6 +127,11 @@ def decode_chunk(place: str, array: StoredArray, data: bytes) -> Array:
         raise InputError(
             place, array.name, f"does not hold {shape} of {array.dtype} ({e})", DAMAGE_FIX
         ) from e
+
+
+def has_crc32c(data: bytes) -> bool:
+    """Whether data ends with the checksum of the rest, as Zarr's codec writes it."""
+    return google_crc32c.value(data[:-4]) == int.from_bytes(data[-4:], "little")
 
 
 def chunk_path(array: StoredArray, index: int) -> str:

@@ -21,7 +21,7 @@ from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import Layout
 from datagen.schemas.sealing import seal, store_record
-from datagen.schemas.shard_sources import ZipFiles
+from datagen.schemas.shard_reading import ZipFiles
 from datagen.schemas.specification import Source
 from datagen.schemas.storage import open_storage
 from datagen.train.run_parts import open_parts

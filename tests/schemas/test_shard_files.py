@@ -32,8 +32,7 @@ from datagen.schemas.shard_files import (
     zarr_metadata,
     zipped,
 )
-from datagen.schemas.shard_reading import read_shard
-from datagen.schemas.shard_sources import ZipFiles
+from datagen.schemas.shard_reading import ZipFiles, read_shard
 from tests.made_runs import make_run, rows_of, small_spec, tables_of
 from tests.schemas.checked import assert_rows, check, commit_object, encoded
 

@@ -338,21 +338,6 @@ def test_starts_follow_from_commits_or_ends_and_other_records_are_set_aside(seal
     ]
 
 
-def test_stages_that_take_longer_than_their_attempt(sealed: Run) -> None:
-    for key in (commit_key(1), "ledger/x-1.json"):
-        for stages, problem in (
-            ({"stage_wall_s": {"draw": 2.0005}}, ""),  # clocks are read one after the other
-            ({"stage_wall_s": {"draw": 1.6, "settle": 0.6}}, "stage_wall_s: the stages sum to 2.2 s"),
-            ({"stage_cpu_s": {"draw": 2.5}}, "stage_cpu_s: the stages sum to 2.5 s"),
-        ):
-            cost = Cost.model_validate({"wall_s": 2.0, "cpu_s": 2.0, **stages})
-            edit(folder_of(sealed) / key, cost=cost.model_dump(mode="json"))
-            findings, _ = check(folder_of(sealed))
-            assert [(f.key, f.cure) for f in findings] == ([(key, None)] if problem else [])
-            assert all(problem in f.problem for f in findings)
-        edit(folder_of(sealed) / key, cost=COST.model_dump(mode="json"))
-
-
 def test_waste_adds_up_and_attempts_are_lost_once_their_shards_are_decided(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", shards=[1])
     for name in ("x", "y"):

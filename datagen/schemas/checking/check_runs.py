@@ -1,27 +1,31 @@
-"""Check a run, or merged runs, one shard at a time."""
+"""Check a run, or merged runs, one shard at a time, and the sealed store."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
+from hashlib import sha256
 from itertools import chain
 
-from datagen.schemas.checking.attempts import (
-    CheckedShard,
+from datagen.schemas.checking.finding import Finding, Reseal, SetAside, below, curable, folder_of, read
+from datagen.schemas.checking.records import (
     LedgerTotals,
-    check_commit,
     check_ledger,
+    check_notes,
+    check_plans,
     check_quarantine,
+    open_roots,
 )
-from datagen.schemas.checking.finding import Finding, SetAside, below, curable
-from datagen.schemas.checking.roots import check_notes, check_plans, open_roots
-from datagen.schemas.checking.sealed import check_store, read_store
 from datagen.schemas.checking.shards import check_shard
-from datagen.schemas.record_files import object_key
+from datagen.schemas.errors import InputError
+from datagen.schemas.record_files import commit_key, object_key
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Commit
+from datagen.schemas.run_records import Commit, foreign_field
+from datagen.schemas.sealing import claimed_names
+from datagen.schemas.sealing.contents import RECORD, SealedPart, StoreRecord, read_contents, store_record
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage, concurrent_map
 
 _THREADS = 4  # hashing and decompression release the GIL
@@ -56,44 +60,47 @@ def check_runs(
     `checked` is filled meanwhile; `seen(done, total)` is called for shards. Every file is read once.
     InputError where there is no run, or one of another format or schema.
     """
-    roots = open_roots(storage)
-    checked.runs = roots.runs
-    found = list(roots.findings)
-    for run in roots.runs:
-        found += below(roots.folder_of(run), chain(check_plans(run), check_notes(run.storage)))
-    if roots.is_merged:
-        found += check_notes(storage)
+    checked.runs, found = open_roots(storage)
+    for run in checked.runs:
+        found += below(folder_of(storage, run.storage), check_plans(run))
+    for place in ({run.storage.url: run.storage for run in checked.runs} | {storage.url: storage}).values():
+        found += below(folder_of(storage, place), check_notes(place))
     yield from found
-    record, of_store = read_store(storage)
+    record, of_store = _read_store(storage)
     yield from of_store
     checked.is_sealed = record is not None
-    work = [(run, sorted(run.committed())) for run in roots.runs]
+    work = [(run, sorted(run.committed())) for run in checked.runs]
     total, done, is_sound = sum(len(shards) for _, shards in work), 0, not found
     threads = _REMOTE_THREADS if storage.folder is None else _THREADS
     with ThreadPoolExecutor(threads) as pool:
         for run, shards in work:
-            prefix, committed = roots.folder_of(run), dict[int, str]()
-            for looked in concurrent_map(pool, 2 * threads, partial(_look_at, run), shards):
-                yield from below(prefix, looked.findings)
-                is_sound = is_sound and not looked.findings
-                if looked.commit is not None:
-                    committed[looked.shard] = looked.commit.attempt
-                    checked.count(looked.commit)
-                    checked.of_other_code += looked.commit.code_digest != run.manifest.code_digest
+            prefix, committed = folder_of(storage, run.storage), dict[int, str]()
+            for shard, commit, findings in concurrent_map(pool, 2 * threads, partial(_look_at, run), shards):
+                yield from below(prefix, findings)
+                is_sound = is_sound and not findings
+                if commit is not None:
+                    committed[shard] = commit.attempt
+                    checked.count(commit)
+                    checked.of_other_code += commit.code_digest != run.manifest.code_digest
                 done += 1
                 seen(done, total)
             rest = (_check_objects(run), check_ledger(run, committed, checked.totals), check_quarantine(run))
             yield from below(prefix, chain.from_iterable(rest))
     if record is not None:
-        yield from check_store(storage, record, roots.runs, is_sound)
+        yield from _check_store(storage, record, checked.runs, is_sound)
 
 
-def _look_at(run: Run, shard: int) -> CheckedShard:
-    """Check one shard: commit, object, rows."""
-    found = check_commit(run, shard)
-    if found.commit is None:
-        return found
-    return replace(found, findings=(*found.findings, *check_shard(run, found.commit)))
+def _look_at(run: Run, shard: int) -> tuple[int, Commit | None, list[Finding]]:
+    """Check one shard: commit, object, rows. A damaged commit is set aside, and the shard made again."""
+    found = read(
+        run.storage,
+        commit_key(shard),
+        Commit,
+        lambda commit: ": ".join(foreign_field(run.manifest, shard, commit) or ()),
+    )
+    if found.record is None:
+        return shard, None, [curable(found.key, "record", found.problem, SetAside(run), shard)]
+    return shard, found.record, check_shard(run, found.record)
 
 
 def _check_objects(run: Run) -> Iterator[Finding]:
@@ -102,3 +109,66 @@ def _check_objects(run: Run) -> Iterator[Finding]:
         name = file.key.removeprefix("shards/")
         if "/" in name or not (name.endswith(".part") or file.key == object_key(name.removesuffix(".zip"))):
             yield curable(file.key, "foreign", "is not the object of an attempt", SetAside())
+
+
+def _read_store(storage: Storage) -> tuple[StoreRecord | None, list[Finding]]:
+    """The record of the sealed store; a finding where it is damaged, or a store has none."""
+    try:
+        record = store_record(storage)
+    except InputError as error:
+        problem = f"{error.field}: {error.problem}" if error.field else error.problem
+        return None, [curable(RECORD, "sealed", problem, Reseal())]
+    if record is None and any(storage.exists(f"{name}/zarr.json") for name in claimed_names(storage)):
+        return None, [curable(RECORD, "sealed", "missing, but there is a store", Reseal())]
+    return record, []
+
+
+def _check_store(storage: Storage, record: StoreRecord, runs: list[Run], is_sound: bool) -> Iterator[Finding]:
+    """Check every file of the store, other files in it, and whether it is outdated.
+
+    `is_sound`: the records and shards of the runs have no findings, so that the content can be compared.
+    """
+    names = [f"{record.name}/{entry.path}" for entry in record.files]
+    checks = storage.concurrent_map(
+        lambda one: _problem(storage, *one),
+        ((key, entry.size, entry.sha256) for key, entry in zip(names, record.files, strict=True)),
+    )
+    for key, problem in zip(names, checks, strict=True):
+        if problem:
+            yield curable(key, "sealed", problem, Reseal())
+    known = set(names)
+    for file in storage.list(record.name):
+        if file.key not in known and not file.key.endswith(".part"):
+            yield curable(file.key, "sealed", "is not a file of the sealed store", Reseal())
+    if not is_sound:
+        return
+    try:
+        contents = read_contents(runs)
+        is_stale = (contents.digest(), contents.parts()) != (record.rows_sha256, record.parts)
+    except InputError:  # no shard is committed any more
+        is_stale = True
+    if is_stale:
+        lost = sum(len(_lost(run, part)) for run in runs if (part := record.part_of(run)))
+        if lost:
+            problem = f"has {lost} shards whose commits are missing"
+            yield Finding(RECORD, "lost", problem, "Make them again with `datagen resume`")
+        else:
+            problem = "is not of the committed shards; nothing is damaged"
+            yield curable(record.name, "stale", problem, Reseal())
+
+
+def _lost(run: Run, part: SealedPart) -> ShardRanges:
+    """Shards of a run that the store has, and that are not committed now."""
+    held = run.planned(part.n).without(ShardRanges.between(part.missing))
+    return held.without(ShardRanges.of(run.committed()))
+
+
+def _problem(storage: Storage, key: str, size: int, digest: str) -> str:
+    try:
+        data = storage.get(key, size)
+    except InputError as error:
+        return error.problem
+    if data is None:
+        return "missing"
+    is_whole = len(data) == size and sha256(data).hexdigest() == digest
+    return "" if is_whole else "has other bytes than were written"

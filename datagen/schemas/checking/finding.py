@@ -68,6 +68,11 @@ def below(prefix: str, findings: Iterable[Finding]) -> Iterator[Finding]:
     return (replace(finding, key=prefix + finding.key) for finding in findings)
 
 
+def folder_of(storage: Storage, place: Storage) -> str:
+    """The folder of a run's storage relative to that of merged runs, with a slash; "" for the same one."""
+    return f"{place.url.removeprefix(storage.url)}/".lstrip("/")
+
+
 def curable(key: str, kind: Kind, problem: str, cure: Cure, shard: int | None = None) -> Finding:
     """A finding that `datagen verify --repair` fixes."""
     return Finding(key, kind, problem, REPAIR, shard, cure)

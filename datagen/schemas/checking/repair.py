@@ -14,10 +14,10 @@ from secrets import token_hex
 
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.cleaning import refuse_running
-from datagen.schemas.checking.finding import Finding, Reseal, Restore, SetAside, read
+from datagen.schemas.checking.finding import Finding, Reseal, Restore, SetAside, folder_of, read
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import SET_ASIDE, commit_key, object_key, superseded_end
-from datagen.schemas.run import Run, label_counts, open_runs
+from datagen.schemas.run import label_counts, open_runs
 from datagen.schemas.run_records import MAX_FILE_BYTES, Commit, foreign_field
 from datagen.schemas.sealing import CLAIM, remove_store, seal, store_record
 from datagen.schemas.sealing.contents import RECORD, SEALED
@@ -93,12 +93,8 @@ def _noting(refused: dict[str, str], key: str) -> Generator[None]:
 def _key_of(storage: Storage, finding: Finding) -> str:
     """Key of the commit of the finding's shard where that is set aside, else of its file."""
     if isinstance(finding.cure, SetAside) and finding.cure.run is not None and finding.shard is not None:
-        return f"{_prefix(storage, finding.cure.run)}{commit_key(finding.shard)}"
+        return f"{folder_of(storage, finding.cure.run.storage)}{commit_key(finding.shard)}"
     return finding.key
-
-
-def _prefix(storage: Storage, run: Run) -> str:
-    return f"{run.storage.url.removeprefix(storage.url)}/".lstrip("/")
 
 
 def _set_aside(storage: Storage, key: str, finding: Finding, into: str) -> None:
@@ -110,7 +106,7 @@ def _set_aside(storage: Storage, key: str, finding: Finding, into: str) -> None:
     commit = read(run.storage, commit_key(finding.shard), Commit).record
     if commit is not None and foreign_field(run.manifest, finding.shard, commit):
         commit = None  # the object that it names is not this shard's
-    rows = f"{_prefix(storage, run)}{object_key(commit.attempt)}" if commit else ""
+    rows = f"{folder_of(storage, run.storage)}{object_key(commit.attempt)}" if commit else ""
     _move(storage, [rows, key] if rows else [key], into)  # the commit last: without it nothing is found
     if commit is not None:
         run.ledger.end(superseded_end(commit, _CAUSE))

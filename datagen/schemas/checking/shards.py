@@ -18,7 +18,7 @@ from datagen.schemas.record_files import object_key
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
 from datagen.schemas.shard_files import chunk_paths, group_metadata, rows_per_shard
-from datagen.schemas.shard_sources import ZipFiles
+from datagen.schemas.shard_reading import ZipFiles
 from datagen.schemas.stored_arrays import Array, StoredArray, arrays_of, decode_chunk
 
 # Arrays that are checked together; every other array is checked by itself.

@@ -120,8 +120,11 @@ def read_contents(runs: Sequence[Run]) -> Contents:
     InputError when no shard is committed, for a damaged commit, or when the runs have different arrays.
     """
     first = runs[0]
-    for run in runs[1:]:
-        _refuse_other_arrays(first, run)
+    for run in runs:
+        one, other = ((r.schema, r.layout.candidates_per_scene) for r in (first, run))
+        if one != other:
+            problem = f"has other arrays than {first.storage.url}: one store cannot hold both"
+            raise InputError(run.storage.url, "manifest.json", problem, "Read them as separate runs")
     held: list[tuple[Run, int, tuple[Commit, ...]]] = []
     for run in runs:
         planned = run.planned(n := run.n)
@@ -133,21 +136,3 @@ def read_contents(runs: Sequence[Run]) -> Contents:
     sealed = tuple(SealedRun(run, n, commits, k == last) for k, (run, n, commits) in enumerate(held))
     layout = max((run.layout for run in runs), key=lambda layout: layout.scenes_per_shard)
     return Contents(sealed, first.schema, layout)
-
-
-def _refuse_other_arrays(first: Run, run: Run) -> None:
-    ours, theirs = first.schema, run.schema
-    pairs = {
-        "schema_name": (ours.name, theirs.name),
-        "schema_version": (ours.version, theirs.version),
-        "candidates_per_scene": (first.layout.candidates_per_scene, run.layout.candidates_per_scene),
-        "spec": (dict(ours.sizes), dict(theirs.sizes)),
-    }
-    for field, (one, other) in pairs.items():
-        if one != other:
-            raise InputError(
-                f"{run.storage.url}/manifest.json",
-                field,
-                f"is {other}, but {one} in {first.storage.url}: one store cannot hold both",
-                "Read them as separate runs",
-            )

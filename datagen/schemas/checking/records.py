@@ -1,76 +1,155 @@
-"""Checks of the records of attempts: commits, the ledger, and the quarantine."""
+"""Checks of the JSON records of a run, or of merged runs: at the root, plans, jobs, ledger, quarantine."""
 
 from __future__ import annotations
 
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass
 
-from datagen.schemas.checking.finding import BACKUP, Finding, Kind, Restore, SetAside, curable, read
+from datagen.schemas.checking.finding import (
+    BACKUP,
+    AnyRecord,
+    Finding,
+    Kind,
+    Restore,
+    SetAside,
+    below,
+    compare,
+    curable,
+    folder_of,
+    read,
+    sound,
+)
+from datagen.schemas.errors import InputError
 from datagen.schemas.quarantine import name_before
 from datagen.schemas.record_files import (
-    commit_key,
+    MERGED,
+    copy_key,
     encode_record,
     end_key,
     is_guess,
     lost_end,
+    refuse_other_format,
     start_from_end,
     start_key,
     utc_now,
 )
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import (
+    FORMAT_VERSION,
     AttemptStart,
     Commit,
-    Cost,
     LedgerEntry,
+    Manifest,
+    Merged,
+    MergedPart,
+    Plan,
     QuarantineRecord,
-    foreign_field,
     other_value,
 )
+from datagen.schemas.shard_ranges import ShardRanges
+from datagen.schemas.storage import Storage
 
-_ROUNDING = 1e-6
-_ROUNDING_S = 1e-3  # clocks are rounded to milliseconds
+_MANIFEST = "manifest.json"
+_BROKEN_OFF = "Merge the runs again: it finishes a merge that was interrupted"
 _OF_ANOTHER = "is the record of another"
-ODD_COST_FIX = "Find out which program wrote it: the record is undamaged"
 
 
-@dataclass(frozen=True, eq=False)
-class CheckedShard:
-    """A committed shard, with its commit where that is undamaged."""
+def open_roots(storage: Storage) -> tuple[list[Run], list[Finding]]:
+    """Open the run, or the parts, in `storage` from undamaged copies of the records at its root.
 
-    shard: int
-    commit: Commit | None
-    findings: tuple[Finding, ...]
+    Returns also the findings on these. InputError where there is no run, or one of another format.
+    """
+    parts, findings = _merged_parts(storage)
+    if parts is None:
+        run, found = _open_run(storage)
+        if run is None and not found:
+            raise InputError(storage.url, _MANIFEST, "not a run: no such file", "Name a run's folder")
+        return [run] if run else [], found
+    runs: list[Run] = []
+    for part in parts:
+        run, found = None, list[Finding]()
+        place = storage.below(part.folder)
+        if next(iter(storage.list(part.folder)), None) is not None:
+            run, found = _open_run(place, part.spec_hash)
+        if run is None and not found:
+            found = [Finding(_MANIFEST, "record", "missing, as is its copy", "Merge the runs again")]
+        findings += below(folder_of(storage, place), found)
+        if run is not None:
+            runs.append(Run(place, run.manifest, ShardRanges.between(part.scenes)))
+    return runs, findings
 
 
-def check_commit(run: Run, shard: int) -> CheckedShard:
-    """Check the shard's commit; a damaged one is set aside, and the shard made again."""
-    found = read(
-        run.storage,
-        commit_key(shard),
-        Commit,
-        lambda c: ": ".join(foreign_field(run.manifest, shard, c) or ()),
-    )
-    if found.record is None:
-        cure = SetAside(run)
-        return CheckedShard(shard, None, (curable(found.key, "record", found.problem, cure, shard),))
-    odd = odd_cost(found.record.cost)
-    findings = [Finding(found.key, "account", odd, ODD_COST_FIX, shard)] if odd else []
-    return CheckedShard(shard, found.record, tuple(findings))
+def _merged_parts(storage: Storage) -> tuple[tuple[MergedPart, ...] | None, list[Finding]]:
+    """The parts, or None where these are not merged runs."""
+    ours, copy = read(storage, MERGED, Merged), read(storage, copy_key(MERGED), Merged)
+    merged = sound(ours, copy)
+    if merged is not None:
+        refuse_other_format(f"{storage.url}/{MERGED}", merged.format_version)
+        return merged.parts, compare(ours, copy, fix=_BROKEN_OFF)
+    if ours.problem == copy.problem == "missing":
+        return None, []
+    return (), compare(ours, copy)
 
 
-def odd_cost(cost: Cost | None) -> str:
-    """Why a cost is inconsistent, or ""."""
-    if cost is None:
+def _open_run(storage: Storage, spec_hash: str | None = None) -> tuple[Run | None, list[Finding]]:
+    """Open the run; it must have this specification where one is given."""
+
+    def refuse(manifest: Manifest) -> str:
+        if spec_hash not in (None, manifest.spec_hash):
+            return "belongs to another run"
+        if manifest.format_version == FORMAT_VERSION and manifest.spec.hash() != manifest.spec_hash:
+            return "spec_hash: is not the hash of the specification in the record"
         return ""
-    for name, stages, whole in (
-        ("wall", cost.stage_wall_s, cost.wall_s),
-        ("cpu", cost.stage_cpu_s, cost.cpu_s),
-    ):
-        total = sum(stages.values())
-        if total > whole * (1 + _ROUNDING) + _ROUNDING_S:
-            return f"cost.stage_{name}_s: the stages sum to {total:g} s, but the attempt has {whole:g} s"
-    return ""
+
+    ours = read(storage, _MANIFEST, Manifest, refuse)
+    copy = read(storage, copy_key(_MANIFEST), Manifest, refuse)
+    manifest = sound(ours, copy)
+    if ours.record and copy.record and ours.record.spec_hash != copy.record.spec_hash:
+        named = _named(storage)
+        if len(named) == 1 and named < {ours.record.spec_hash, copy.record.spec_hash}:
+            return _open_run(storage, named.pop())
+    if manifest is None:
+        return None, compare(ours, copy)
+    refuse_other_format(f"{storage.url}/{_MANIFEST}", manifest.format_version)
+    return Run(storage, manifest), compare(ours, copy)
+
+
+def _named(storage: Storage) -> set[str]:
+    commits = (read(storage, file.key, Commit).record for file in storage.list("commits"))
+    plans = (read(storage, file.key, Plan).record for file in storage.list("plans"))
+    return {record.spec_hash for record in (*commits, *plans) if record and record.spec_hash}
+
+
+def check_plans(run: Run) -> list[Finding]:
+    """Check plans: each has its copy, and a larger n than the one before."""
+    findings: list[Finding] = []
+    n = last = 0
+    fix = "Restore the file from a backup, or set the number again with `datagen resume RUN --n N`"
+    for number in sorted(run.numbers("plans", width=1) | run.numbers(copy_key("plans"), width=1)):
+        key, expected = f"plans/{number}.json", {"spec_hash": run.manifest.spec_hash, "number": number}
+        if number > last + 1:
+            findings.append(Finding(f"plans/{last + 1}.json", "record", "missing, as is its copy", fix))
+        ours, copy = (
+            read(run.storage, k, Plan, lambda plan, e=expected: ": ".join(other_value(plan, **e) or ()))
+            for k in (key, copy_key(key))
+        )
+        findings += compare(ours, copy)
+        plan, last = sound(ours, copy), number
+        if plan is not None and plan.n <= n:
+            problem = f"n: {plan.n} is not more than in the plan before"
+            findings.append(Finding(key, "record", problem, "Remove the plan"))
+        n = max(n, plan.n if plan else 0)
+    if not n:
+        findings.append(Finding("plans", "record", "has no plan with the number of samples wanted", fix))
+    return findings
+
+
+def check_notes(storage: Storage) -> Iterator[Finding]:
+    """Check the records of jobs, on which no row depends; their states may be torn by a power cut."""
+    for file in storage.list("jobs"):
+        is_record = file.key.endswith(".json") and not file.key.endswith(".state.json")
+        if is_record and (problem := read(storage, file.key, AnyRecord).problem):
+            yield curable(file.key, "record", problem, SetAside())
 
 
 @dataclass
@@ -134,8 +213,6 @@ def _check_end(run: Run, attempt: str, totals: LedgerTotals) -> Iterator[Finding
         yield curable(
             start.key, "account", start.problem, Restore(encode_record(start_from_end(noted))), noted.shard
         )
-    if odd := odd_cost(noted.cost):
-        yield Finding(end.key, "account", odd, ODD_COST_FIX, noted.shard)
     totals.without_account += noted.cost is None
     totals.wasted_wall_s += noted.cost.wall_s if noted.cost else 0.0
 
