@@ -46,12 +46,9 @@ class ShardRanges(Sequence[int]):
         return cls(np.stack([first, last + 1], axis=1))
 
     def union(self, others: ShardRanges) -> ShardRanges:
-        merged: list[tuple[int, int]] = []
-        for first, past in sorted([*self.ranges, *others.ranges]):
-            if merged and first <= merged[-1][1]:
-                first, past = merged[-1][0], max(merged.pop()[1], past)
-            merged.append((first, past))
-        return ShardRanges.between(merged)
+        more = others.without(self)
+        bounds = np.concatenate([self.bounds, more.bounds])
+        return _ALL.without(_ALL.without(ShardRanges(bounds[np.argsort(bounds[:, 0])])))
 
     def times(self, size: int) -> ShardRanges:
         """The numbers in the blocks of `size` consecutive numbers that these count."""
@@ -126,3 +123,6 @@ class ShardRanges(Sequence[int]):
     def __repr__(self) -> str:
         shown = ", ".join(f"{first}-{past - 1}" for first, past in self.bounds[:10])
         return f"ShardRanges({shown}{', ...' if len(self.bounds) > 10 else ''})"
+
+
+_ALL = ShardRanges.of(range(2**62))

@@ -28,7 +28,6 @@ from datagen.schemas.stored_arrays import (
     MAX_META_BYTES,
     Array,
     StoredArray,
-    chunk_path,
     decode_chunk,
     has_crc32c,
     parse_metadata,
@@ -66,7 +65,7 @@ class ShardObject:
 
     def chunks(self, wanted: Wanted) -> Iterator[tuple[str, bytes]]:
         files = self._open()
-        for path in (chunk_path(array, index) for array, index in wanted):
+        for path in (array.path(index) for array, index in wanted):
             yield f"{self.url}/{path}", files.get(path)
 
     def _open(self) -> ZipFiles:
@@ -127,7 +126,7 @@ class StoreFiles:
 
     def _chunk(self, array: StoredArray, index: int) -> tuple[str, bytes]:
         file, inner = divmod(index, array.per_file) if array.per_file else (index, 0)
-        key = chunk_path(array, file)
+        key = array.path(file)
         place = f"{self.url}/{key}"
         if not array.per_file:
             data = self.storage.get(key, MAX_DECODED_BYTES)

@@ -14,16 +14,16 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import chain, count, takewhile
 
+import numpy as np
 import zarr
 from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import TABLES
+from datagen.schemas.fields import TABLES, Field
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.run import open_runs
 from datagen.schemas.run_records import FileEntry
-from datagen.schemas.sealing.array_files import ArrayFiles
 from datagen.schemas.sealing.contents import (
     RECORD,
     SEALED,
@@ -33,16 +33,25 @@ from datagen.schemas.sealing.contents import (
     read_contents,
     store_record,
 )
-from datagen.schemas.shard_files import cf_attributes, described, root_attributes, zarr_metadata
+from datagen.schemas.shard_files import (
+    cf_attributes,
+    described,
+    encode_chunk,
+    fill_value,
+    root_attributes,
+    with_crc32c,
+    zarr_metadata,
+)
 from datagen.schemas.shard_reading import committed_place
 from datagen.schemas.storage import Storage
-from datagen.schemas.stored_arrays import arrays_of, parse_metadata
+from datagen.schemas.stored_arrays import Array, StoredArray, arrays_of, parse_metadata
 
 __all__ = ["SEALED", "SealedPart", "StoreRecord", "seal", "store_record"]
 
 _ROOT = "zarr.json"
 _NUMBERED = re.compile(r"data(?:-([0-9]+))?\.zarr")
 CLAIM = ".claim"  # beside a store: who made it first writes the store
+_NO_CHUNK = 2**64 - 1  # offset and size of a chunk beyond the array's end
 Tick = Callable[[int, int], None]
 
 
@@ -159,3 +168,53 @@ def sealed_metadata(contents: Contents) -> dict[str, bytes]:
         warnings.simplefilter("ignore")
         zarr.consolidate_metadata(MemoryStore(store), zarr_format=3)
     return {path: buffer.to_bytes() for path, buffer in store.items()}
+
+
+class ArrayFiles:
+    """Collects an array's chunks and yields (path, bytes) of each full file. Holds at most one file."""
+
+    def __init__(self, array: StoredArray, field: Field) -> None:
+        self._array, self._field = array, field
+        self._chunks: list[bytes] = []
+        self._pending: list[Array] = []  # rows that do not fill a chunk yet
+        self._files = 0
+
+    @property
+    def is_aligned(self) -> bool:
+        """Whether the next row begins a chunk."""
+        return not self._pending
+
+    def add_chunk(self, chunk: bytes) -> Iterator[tuple[str, bytes]]:
+        """Add an encoded chunk, at the beginning of a chunk."""
+        self._chunks.append(chunk)
+        if len(self._chunks) == self._array.per_file:
+            yield self._file()
+
+    def add_rows(self, values: Array) -> Iterator[tuple[str, bytes]]:
+        """Add rows, which are encoded as soon as they fill a chunk."""
+        rows = np.concatenate([*self._pending, values])
+        size = self._array.chunk_rows
+        for first in range(0, len(rows) - size + 1, size):
+            yield from self.add_chunk(encode_chunk(self._field, rows[first : first + size]))
+        rest = rows[len(rows) // size * size :]
+        self._pending = [rest.copy()] if len(rest) else []
+
+    def close(self) -> Iterator[tuple[str, bytes]]:
+        """Fill the last chunk, and yield the last file."""
+        if self._pending:
+            missing = self._array.chunk_rows - len(self._pending[0])
+            shape = (missing, *self._array.shape[1:])
+            filler = np.full(shape, fill_value(self._field), self._pending[0].dtype)
+            yield from self.add_rows(filler)
+        if self._chunks:
+            yield self._file()
+
+    def _file(self) -> tuple[str, bytes]:
+        index = np.full((self._array.per_file, 2), _NO_CHUNK, "<u8")
+        sizes = np.array([len(chunk) for chunk in self._chunks], np.uint64)
+        index[: len(sizes), 0] = np.cumsum(sizes) - sizes
+        index[: len(sizes), 1] = sizes
+        data = b"".join([*self._chunks, with_crc32c(index.tobytes())])
+        path = self._array.path(self._files)
+        self._chunks, self._files = [], self._files + 1
+        return path, data
