@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.schemas.identity import Stream, canonical_json, digest_of, generator, sample_ids
+from datagen.schemas.identity import Stream, digest_of, generator, sample_ids
 
 seeds = st.integers(0, 2**63 - 1)
 
@@ -48,10 +48,3 @@ def test_ids_depend_on_nothing_but_specification_scene_and_candidate(scene: int,
     np.testing.assert_array_equal(ids, again)
     assert len(np.unique(ids, axis=0)) == len(rows)
     assert (ids != sample_ids("ac" * 32, scene, np.array(rows))).any()
-
-
-def test_canonical_json_orders_keys_and_keeps_values() -> None:
-    assert (
-        canonical_json({"b": [1, 2.5], "a": {"d": None, "c": True}})
-        == '{"a":{"c":true,"d":null},"b":[1,2.5]}'
-    )

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -25,14 +25,10 @@ def test_every_part_moves_the_hash() -> None:
         {"settle": {"engine": "pybullet"}}, {"observation": {"noise": {"enabled": True}}},
         {"candidates": {"per_scene": "grid"}}, {"visibility": {"window_px": 32}}, {"heuristic": {"mu": 0.5}},
     )  # fmt: skip
+    again = Specification.model_validate_json(SPEC.model_dump_json())
+    assert again == SPEC and again.hash() == SPEC.hash()
     hashes = {Specification.model_validate(SOURCES | change).hash() for change in changes}
     assert len(hashes | {SPEC.hash()}) == len(changes) + 1
-
-
-def test_the_hash_survives_a_round_trip_through_json() -> None:
-    again = Specification.model_validate_json(SPEC.model_dump_json())
-    assert again == SPEC
-    assert again.hash() == SPEC.hash()
 
 
 NONSENSE: tuple[dict[str, Any], ...] = (
@@ -64,23 +60,14 @@ def test_bases_are_scaled_below_the_reach_of_the_panda(reach_m: float, radius_m:
     np.testing.assert_array_equal(scaled.radius_of_base_m(np.array([0.855, 1.0])), [radius_m, radius_m])
 
 
-def test_it_cannot_be_changed() -> None:
-    with pytest.raises(ValidationError):
-        SPEC.seed = 3  # pyright: ignore[reportAttributeAccessIssue]
-
-
 @given(st.integers(1, 10**7))
+@example(180_000)
 def test_a_layout_holds_n_and_wastes_less_than_a_shard(n: int) -> None:
     layout = layout_of(SPEC, n)
     shards = layout.shards_for(n)
     assert (shards - 1) * layout.samples_per_shard < n <= shards * layout.samples_per_shard
     assert 1 <= layout.scenes_per_shard <= 500  # a minute of work
-
-
-def test_the_papers_number_of_labels_divides_into_whole_shards() -> None:
-    layout = layout_of(SPEC, 180_000)
-    assert layout.scenes_per_shard == 40
-    assert layout.shards_for(180_000) * layout.samples_per_shard == 180_000
+    assert n != 180_000 or (layout.scenes_per_shard, shards * layout.samples_per_shard) == (40, n)
 
 
 @pytest.mark.parametrize("name", sorted(SCHEMAS))
