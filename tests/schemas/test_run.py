@@ -13,9 +13,9 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMA_VERSION
 from datagen.schemas.record_files import copy_key, publish
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import FileEntry, Layout, LedgerEntry, QuarantineRecord
+from datagen.schemas.run_records import FileEntry, Layout, LedgerEntry
 from datagen.schemas.storage import open_storage
-from tests.made_runs import commit_of, files_of, make_run, manifest_of, small_spec, write
+from tests.made_runs import commit_of, files_of, give_up, make_run, manifest_of, small_spec, write
 from tests.schemas.checked import edit
 
 pytestmark = pytest.mark.usefixtures("few_arrays")
@@ -57,25 +57,10 @@ def test_two_creators_of_one_run_agree_and_complete_what_a_killed_one_began(tmp_
 def test_another_specification_is_refused_with_every_differing_field(tmp_path: Path) -> None:
     make_run(tmp_path, shards=[])
     before = files_of(tmp_path)
-    with pytest.raises(InputError) as e:
+    told = r"observation.n_points: 64, but 65 .* seed: 0, but 7 .*'all', but 'val' was given"
+    with pytest.raises(InputError, match=told):
         make_run(tmp_path, n=500, spec=small_spec(seed=7, n_points=65, split="val"), shards=[])
-    for part in ("seed: 0, but 7", "observation.n_points: 64, but 65", "'all', but 'val' was given"):
-        assert part in str(e.value)
-    assert "\n" not in str(e.value) and files_of(tmp_path) == before
-
-
-def test_places_without_a_run_are_refused_and_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("x")
-    with pytest.raises(InputError, match="holds other files"):
-        make_run(tmp_path, shards=[])
-    for name, problem in (
-        ("", r"manifest\.json: not a run"),
-        ("none", "no such folder"),
-        ("thesis.tex", "not a folder"),
-    ):
-        with pytest.raises(InputError, match=problem):
-            Run.open(tmp_path / name)
-    assert set(files_of(tmp_path)) == {"thesis.tex"}
+    assert files_of(tmp_path) == before
 
 
 def test_of_racing_committers_one_wins_and_the_run_holds_its_attempt(tmp_path: Path) -> None:
@@ -117,11 +102,10 @@ def test_the_ledger_knows_who_began_and_who_never_ended(tmp_path: Path) -> None:
 
 def test_quarantine_takes_a_shard_from_the_missing_until_it_is_committed(tmp_path: Path) -> None:
     run = make_run(tmp_path, n=30, shards=[0])
-    record = QuarantineRecord(
-        shard=2, seed=0, first_scene=4, scenes=2, attempts=("a",), causes=("c",), stacks=("s",), created="now"
-    )
-    assert run.quarantine(record) and not run.quarantine(record.model_copy(update={"created": "later"}))
-    assert (run.missing(), run.quarantined(), run.quarantine_records()) == ([1], {2}, [record])
+    give_up(run, 2, "c")
+    (record,) = run.quarantine_records()
+    assert not run.quarantine(record.model_copy(update={"created": "later"}))
+    assert (run.missing(), run.quarantined(), record.causes) == ([1], {2}, ("c",))
     assert run.commit(write(run, 2, "again"))
     assert (run.missing(), run.quarantined()) == ([1], set())
 
@@ -136,9 +120,7 @@ def test_other_names_in_commits_do_not_count(tmp_path: Path) -> None:
         "٠٠٠٠٠٢.json",
         "sub/000002.json",
     ):
-        path = tmp_path / "commits" / name
-        path.parent.mkdir(exist_ok=True)
-        path.write_text("{}")
+        run.storage.put(f"commits/{name}", b"{}")
     assert run.committed() == {0}
 
 
@@ -147,7 +129,7 @@ HOSTILE: list[tuple[str, dict[str, Any]]] = [
     *(("attempt", {"attempt": name}) for name in ("../../../etc", "/etc", "", "a\n", "x" * 101)),
     *(
         ("object.path", {"object": OBJECT | {"path": path}})
-        for path in ("../../manifest.json", "/etc/passwd", "a//b")
+        for path in ("../../manifest.json", "/etc", "a//b")
     ),
     ("path", {"object": OBJECT | {"path": "a-1.zip"}}),
     *(("object.size", {"object": OBJECT | {"size": size}}) for size in (-1, 2**70)),
