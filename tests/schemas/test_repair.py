@@ -1,4 +1,4 @@
-"""Repair restores records and sets shards aside; a resumed run then has the rows of the undamaged one."""
+"""Repair of what bytes alone do not show; test_damage.py and test_swaps.py damage and repair every file."""
 
 from __future__ import annotations
 
@@ -6,22 +6,19 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from datagen.schemas.checking import repair
 from datagen.schemas.checking.repair import Repaired, repair_runs
 from datagen.schemas.errors import InputError
-from datagen.schemas.record_files import MERGED, commit_key
-from datagen.schemas.run import Run, open_runs
-from datagen.schemas.storage import Storage, open_storage
-from tests.made_runs import files_of, make_run
+from datagen.schemas.record_files import commit_key
+from datagen.schemas.run import Run
+from datagen.schemas.storage import open_storage
+from tests.made_runs import files_of, flip, make_run
 from tests.schemas.checked import (
     assert_rows,
-    fill,
     folder_of,
     found,
-    merge,
     resume,
     sealed_run,
     stored,
@@ -32,49 +29,6 @@ pytestmark = pytest.mark.usefixtures("few_arrays")
 
 def repair_at(folder: Path) -> Repaired:
     return repair_runs(open_storage(folder, probe=False, create=False))
-
-
-def flip(path: Path) -> str:
-    """Change one bit of a file's last byte; its path below the run."""
-    data = path.read_bytes()
-    path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
-    return str(path)
-
-
-# Damage, repair, resume -----------------------------------------------------------------------
-
-
-def merged(folder: Path, *runs: tuple[int, int, list[int]]) -> Storage:
-    """Merged runs, of seeds, scenes per shard and shards; the merge is complete."""
-    for k, (seed, size, shards) in enumerate(runs):
-        fill(folder, f"r{k}", shards, 40, size, seed)
-    merge(folder, [f"r{k}" for k in range(len(runs))], "run")
-    resume(storage := open_storage(folder / "run"))
-    return storage
-
-
-@pytest.mark.parametrize("second", [(2, 2, [0, 1, 2]), (1, 3, [0, 1])], ids=["parts", "overlapping"])
-def test_repair_and_resume_give_the_rows_of_the_undamaged_runs(
-    second: tuple[int, int, list[int]], tmp_path: Path
-) -> None:
-    storage, place = merged(tmp_path, (1, 2, [2, 3]), second), tmp_path / "run"
-    rows, rng, whole = stored(storage), np.random.default_rng(3), files_of(place)
-    shutil.copytree(place, tmp_path / "whole")
-    for _ in range(6):
-        run = open_runs(place)[0]
-        always = [folder_of(run) / commit_key(0), folder_of(run) / f"shards/{run.commit_of(1).attempt}.zip"]
-        keys = [key for key in whole if not key.endswith(".claim")]
-        for path in {*always, *(place / key for key in rng.choice(keys, 3, replace=False))}:
-            flip(path)
-        repaired = repair_at(place)
-        left = [(finding.kind, finding.key) for finding in repaired.left]
-        assert left in ([], [("lost", "data.json")]) and found(place) == left
-        assert (place / repaired.into / always[0].relative_to(place)).exists()
-        resume(storage)
-        assert_rows(stored(storage), rows)
-        assert found(place) == [] and repair_at(place).set_aside == []
-        shutil.rmtree(place)
-        shutil.copytree(tmp_path / "whole", place)
 
 
 def test_a_commit_in_the_place_of_another_leaves_the_shard_that_it_names(tmp_path: Path) -> None:
@@ -139,11 +93,3 @@ def test_a_run_on_s3_is_repaired(bucket: str) -> None:
     assert [f.kind for f in repaired.left] == ["lost"] and repaired.set_aside == ["commits/000001.json"]
     assert storage.exists(f"{repaired.into}/shards/a-1.zip")
     assert Run.open(storage).ledger.end_of("a-1").outcome == "superseded"  # type: ignore[union-attr]
-
-
-def test_the_record_of_merged_runs_is_restored(tmp_path: Path) -> None:
-    merged(tmp_path, (1, 2, [0]), (2, 2, [0]))
-    before = files_of(tmp_path / "run")
-    (tmp_path / "run" / MERGED).unlink()
-    assert repair_at(tmp_path / "run").restored == [MERGED]
-    assert files_of(tmp_path / "run") == before
