@@ -250,28 +250,14 @@ def lost_end(start: AttemptStart, ended: str = "", cause: str = LOST_CAUSE) -> L
 
     It is a guess, made once the shard is decided: the attempt, if still running, may replace it.
     """
-    return LedgerEntry(
-        attempt=start.attempt,
-        shard=start.shard,
-        outcome="lost",
-        cause=cause,
-        started=start.started,
-        ended=ended,
-    )
+    named = {name: getattr(start, name) for name in ("attempt", "shard", "started")}
+    return LedgerEntry(outcome="lost", cause=cause, ended=ended, **named)
 
 
 def superseded_end(commit: Commit, cause: str, started: str = "") -> LedgerEntry:
     """The end record of an attempt whose commit does not count any more, with the commit's cost."""
-    return LedgerEntry(
-        attempt=commit.attempt,
-        shard=commit.shard,
-        outcome="superseded",
-        cause=cause,
-        started=started,
-        ended=commit.created,
-        cost=commit.cost,
-        host=commit.host,
-    )
+    kept = {name: getattr(commit, name) for name in ("attempt", "shard", "cost", "host")}
+    return LedgerEntry(outcome="superseded", cause=cause, started=started, ended=commit.created, **kept)
 
 
 def start_from_end(end: LedgerEntry) -> AttemptStart:

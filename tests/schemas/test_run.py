@@ -164,17 +164,7 @@ def test_hostile_commits_are_refused_with_file_and_field(tmp_path: Path) -> None
 def test_broken_and_truncated_records_are_refused_with_their_file(tmp_path: Path) -> None:
     run = make_run(tmp_path, shards=[0])
     whole = (tmp_path / "commits/000000.json").read_bytes()
-    texts = (
-        b"",
-        b"{",
-        b"[]",
-        b"null",
-        b"[" * 100_000,
-        b"\xff\xff\xfe",
-        b"{}",
-        whole[:97],
-        whole[:-1],
-    )
+    texts = (b"", b"{", b"[]", b"null", b"[" * 100_000, b"\xff\xff\xfe", b"{}", whole[:97], whole[:-1])
     for text in texts:
         (tmp_path / "commits/000000.json").write_bytes(text)
         with pytest.raises(InputError) as e:

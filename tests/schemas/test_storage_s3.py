@@ -14,11 +14,7 @@ from obstore.exceptions import GenericError
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.storage import Storage, open_storage, remote_objects
-from datagen.schemas.storage.errors import (
-    StoreUnavailable,
-    repeated_for_minutes,
-    store_trouble,
-)
+from datagen.schemas.storage.errors import StoreUnavailable, repeated_for_minutes, store_trouble
 from tests.s3_servers import Faults, environment, faulty_proxy
 
 Behind = Callable[[Faults], AbstractContextManager[Storage]]
@@ -68,11 +64,7 @@ def test_what_was_done_and_answered_by_an_error_is_done(behind: Behind):
             faults.script = [second]
             assert not s.put_new(f"c/{i}", b"theirs")
             assert s.get(f"c/{i}", 9) == b"ours"
-        for verb in (
-            lambda: s.put("p", b"1"),
-            lambda: s.delete(["p", "none"]),
-            lambda: s.exists("c/0"),
-        ):
+        for verb in (lambda: s.put("p", b"1"), lambda: s.delete(["p", "none"]), lambda: s.exists("c/0")):
             faults.script = ["lost_answer"]
             verb()
         assert not s.exists("p")

@@ -160,10 +160,8 @@ def open_storage(path: str | Path, probe: bool = True, create: bool = True) -> S
 
         storage = Storage(RemoteObjects(text))
     elif colon and scheme != "file":
-        problem = "is neither a folder nor an s3:// address"
-        raise InputError(
-            f"{scheme}://...", "", problem, "Name a folder or an s3:// address that you can write"
-        )
+        fix = "Name a folder or an s3:// address that you can write"
+        raise InputError(f"{scheme}://...", "", "is neither a folder nor an s3:// address", fix)
     else:
         folder = Path(rest if colon else text).expanduser().absolute()
         refuse_not_utf8(str(folder))  # records contain it
@@ -195,12 +193,9 @@ def _probe(storage: Storage) -> None:
     key = f".probe-{secrets.token_hex(8)}"
     try:
         if not storage.put_new(key, b"first") or storage.put_new(key, b"second"):
-            raise InputError(
-                storage.url,
-                "",
-                "does not support create-only writes, so two jobs could overwrite each other",
-                "Use a local disk or an object store with conditional writes",
-            )
+            problem = "does not support create-only writes, so two jobs could overwrite each other"
+            fix = "Use a local disk or an object store with conditional writes"
+            raise InputError(storage.url, "", problem, fix)
     finally:
         storage.delete([key])
 
