@@ -15,11 +15,11 @@ from datagen.schemas.checking.cleaning import clean_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobRecord, Jobs, JobState, new_job_id
 from datagen.schemas.record_files import commit_key, utc_now
-from datagen.schemas.run import Run, open_runs
+from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
-from datagen.schemas.storage import Storage, open_storage
+from datagen.schemas.storage import Storage
 from tests.made_runs import attempt, files_of, make_run, write
-from tests.schemas.checked import fill, folder_of, found, merge, tree
+from tests.schemas.checked import folder_of, found, tree
 
 pytestmark = pytest.mark.usefixtures("few_arrays")
 HOUR_S = 3600
@@ -113,17 +113,3 @@ def test_nothing_is_removed_where_a_damaged_record_may_name_it(tmp_path: Path) -
             clean_runs(run.storage, kept_s=-60)
         assert all((tmp_path / name).exists() for name in ("shards/a-0.zip", "data.zarr/zarr.json"))
         (tmp_path / key).write_bytes(whole)
-
-
-def test_parts_of_merged_runs_are_cleaned(tmp_path: Path) -> None:
-    for who, seed in (("a", 1), ("b", 2)):
-        fill(tmp_path, who, [0], seed=seed)
-    merge(tmp_path, "ab")
-    storage = open_storage(tmp_path / "out")
-    before = tree(storage)
-    part = open_runs(storage)[1]
-    write(part, 0, "late")
-    for key in (f".probe-{'c' * 16}", "data.zarr/x"):
-        part.storage.put(key, b"")
-    storage.put(f".probe-{'c' * 16}", b"")
-    assert clean_runs(storage, kept_s=-60).files == 4 and tree(storage) == before

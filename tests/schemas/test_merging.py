@@ -21,6 +21,7 @@ from datagen.schemas.sealing import store_record
 from datagen.schemas.specification import Source
 from datagen.schemas.storage import Storage, open_storage
 from datagen.train.run_parts import open_parts
+from tests.faults.crash_points_operations import remake
 from tests.made_runs import Tables, files_of, make_run, rows_of, small_spec, tables_of
 from tests.schemas.checked import (
     Arrays,
@@ -33,7 +34,6 @@ from tests.schemas.checked import (
     folder_of,
     found,
     merge,
-    resume,
     stored,
     tree,
 )  # fmt: skip
@@ -57,6 +57,9 @@ def test_the_cost_of_duplicates_is_kept_and_missing_shards_are_named(tmp_path: P
     assert record is not None and record.parts[0].missing == ((3, 5),)
 
 
+_OF = "sample_scene_index"
+
+
 def of_scenes(run: Run, scenes: Iterable[int]) -> Arrays:
     """The rows that the specification has for these scenes."""
     layout = Layout(scenes_per_shard=1, candidates_per_scene=5)
@@ -65,29 +68,23 @@ def of_scenes(run: Run, scenes: Iterable[int]) -> Arrays:
     return {name: np.concatenate([tables[t][name] for tables in each]) for t in (0, 1) for name in each[0][t]}
 
 
-def by_scene(arrays: Arrays) -> Arrays:
-    orders = (
-        np.argsort(arrays["scene_index"], kind="stable"),
-        np.argsort(arrays["sample_scene_index"], kind="stable"),
-    )
-    samples = len(arrays["sample_scene_index"])
-    is_sample = {name: name.startswith(("sample", "candidate", "label", "distance")) for name in arrays}
-    assert all(
-        len(values) == (samples if is_sample[name] else len(orders[0])) for name, values in arrays.items()
-    )
-    return {name: values[orders[is_sample[name]]] for name, values in arrays.items()}
+def by_scene(run: Run, arrays: Arrays) -> Arrays:
+    """The rows in order of their scenes."""
+    orders = {t: np.argsort(arrays[k], kind="stable") for t, k in (("scene", "scene_index"), ("sample", _OF))}
+    return {f.name: arrays[f.name][orders[table]] for table, f in run.schema.fields}
 
 
 def assert_scenes(storage: Storage, scenes: Iterable[int]) -> None:
     """The store, and the runs as training reads them, have these scenes, each once, with their rows."""
     runs = open_runs(storage)
     wanted = of_scenes(runs[0], sorted(scenes))
-    assert_rows(by_scene(stored(storage)), wanted)
+    assert_rows(by_scene(runs[0], stored(storage)), wanted)
     counts = label_counts(runs)
     assert (counts.labels, counts.n) == (len(wanted["label"]), runs[0].n)
     parts = open_parts([storage.url], list(wanted), allow_incomplete=True)
     read = [place.read(part.arrays.values()) for part in parts for place in part.shards]
-    assert_rows(by_scene({name: np.concatenate([each[name] for each in read]) for name in wanted}), wanted)
+    found_ = {name: np.concatenate([each[name] for each in read]) for name in wanted}
+    assert_rows(by_scene(runs[0], found_), wanted)
     assert found(storage.url) == []
 
 
@@ -121,11 +118,11 @@ def test_each_scene_counts_once_whatever_the_sizes_of_shards_and_the_order_of_so
         assert_scenes(storage, held & set(range(end)))
     merge(folder, names[::-1], "other")
     assert whole(folder / "other") == whole(folder / "out")
-    resume(storage)  # parts lack shards
+    remake(folder / "out")  # parts lack shards
     assert_scenes(storage, range(end))
     for run in open_runs(storage):
         run.grow(5 * (end + more))
-    resume(storage)
+    remake(folder / "out")
     assert_scenes(storage, range(end + more))
 
 

@@ -14,12 +14,12 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import commit_key
 from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage
+from tests.faults.crash_points_operations import remake
 from tests.made_runs import files_of, flip, make_run
 from tests.schemas.checked import (
     assert_rows,
     folder_of,
     found,
-    resume,
     sealed_run,
     stored,
 )  # fmt: skip
@@ -47,10 +47,10 @@ def test_a_lost_commit_is_made_again_and_the_store_is_kept_meanwhile(tmp_path: P
     (left,) = repair_at(tmp_path).left
     assert left.kind == "lost" and "datagen resume" in left.fix
     assert files_of(tmp_path / "data.zarr") == store
-    resume(run.storage)
+    remake(folder_of(run))
     assert_rows(stored(run.storage), rows)
     run.grow(39)
-    resume(run.storage)
+    remake(folder_of(run))
     for key in ("plans/2.json", "copies/plans/2.json"):
         (tmp_path / key).unlink()
     (left,) = repair_at(tmp_path).left

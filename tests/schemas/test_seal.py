@@ -41,6 +41,7 @@ from tests.schemas.checked import (
     of,
     stored,
 )  # fmt: skip
+from tests.small_disk import small_disk
 
 pytestmark = pytest.mark.usefixtures("few_arrays")
 
@@ -175,6 +176,12 @@ def test_an_up_to_date_store_is_not_written_and_a_grown_run_switches_to_another(
     assert found(tmp_path) == []
     run.storage.delete(["data.json"])
     assert seal(run.storage) == f"{tmp_path}/data-4.zarr"  # another process may still remove those before
+
+
+@pytest.fixture
+def tiny_disk(tmp_path: Path) -> Iterator[Path]:
+    with small_disk(tmp_path / "tiny", "512k") as disk:
+        yield disk
 
 
 def test_a_disk_that_fills_up_keeps_what_is_committed_and_continues_with_room(tiny_disk: Path) -> None:
