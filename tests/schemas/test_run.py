@@ -9,12 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from datagen.schemas import run_records
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMA_VERSION
 from datagen.schemas.record_files import copy_key, publish
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import FileEntry, Layout, LedgerEntry
+from datagen.schemas.run_records import FileEntry, Layout, LedgerEntry, StageClock
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import open_storage
 from tests.made_runs import commit_of, files_of, give_up, make_run, manifest_of, small_spec, write
 from tests.schemas.checked import edit
@@ -185,3 +189,48 @@ def test_edited_manifests_and_other_formats_and_versions_are_refused(tmp_path: P
         edit(path, **changes)
         with pytest.raises(InputError, match=problem):
             _ = Run.open(tmp_path).schema
+
+
+def test_nested_and_failing_stages_are_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s, clock = [0.0], StageClock()
+    monkeypatch.setattr(run_records.time, "perf_counter", lambda: now_s[0])
+    monkeypatch.setattr(run_records.time, "process_time", lambda: now_s[0] / 2)
+    with clock.stage("draw"):
+        now_s[0] += 1
+        with pytest.raises(ValueError), clock.stage("grasps"):
+            now_s[0] += 10
+            with clock.stage("execute"):
+                now_s[0] += 100
+                raise ValueError
+        with clock.stage("grasps"):
+            now_s[0] += 20
+        now_s[0] += 2
+    assert clock.wall_s == {"draw": 3, "grasps": 30, "execute": 100}
+    assert clock.cpu_s == {"draw": 1.5, "grasps": 15, "execute": 50}
+    with pytest.raises(KeyError, match="unknown stage"), clock.stage("lunch"):
+        pass
+
+
+SETS = st.sets(st.integers(0, 60), max_size=40)
+
+
+@given(SETS, SETS)
+def test_they_are_sets_of_numbers(a: set[int], b: set[int]) -> None:
+    ours, theirs = ShardRanges.of(sorted(a, reverse=True)), ShardRanges.of(b)
+    assert ours == sorted(a) and list(ours) == sorted(a) and len(ours) == len(a)
+    assert [ours[i] for i in range(-len(a), len(a))] == sorted(a) * 2
+    assert ours[1:7:2] == sorted(a)[1:7:2]
+    assert ours.without(theirs) == sorted(a - b)
+    assert ours.within(theirs) == sorted(a & b)
+    assert {shard for shard in range(-1, 62) if shard in ours} == a
+    assert (ours == theirs) == (a == b) and (a != b or hash(ours) == hash(theirs))
+
+
+def test_a_planned_trillion_costs_nothing() -> None:
+    planned = ShardRanges.of(range(10**12))
+    open_ = planned.without(ShardRanges.of([0, 1, 5 * 10**11]))
+    assert len(open_) == 10**12 - 3 and open_[0] == 2 and open_[-1] == 10**12 - 1
+    assert open_.bounds.nbytes == 32
+    with pytest.raises(IndexError):
+        open_[len(open_)]
+    assert ShardRanges.of(range(5, 5)) == [] and "x" not in planned
