@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 
 from datagen.schemas.checking import repair
-from datagen.schemas.checking.cleaning import clean_runs
-from datagen.schemas.checking.repair import Repaired, repair_runs
+from datagen.schemas.checking.repair import Repaired, clean_runs, repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobRecord, Jobs, JobState, new_job_id
 from datagen.schemas.record_files import commit_key, utc_now

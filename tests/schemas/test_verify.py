@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datagen.schemas.checking.finding import Finding, Restore, SetAside
+from datagen.schemas.checking.finding import Finding, SetAside
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import RecordSchema
 from datagen.schemas.jobs import JobRecord, Jobs, JobState, new_job_id
@@ -67,8 +67,8 @@ def only(run: Run) -> Finding:
 
 
 def restored(finding: Finding, model: type[Any]) -> Any:
-    assert isinstance(finding.cure, Restore)
-    return decode_record(finding.key, finding.cure.data, model)
+    assert isinstance(finding.cure, bytes)
+    return decode_record(finding.key, finding.cure, model)
 
 
 def test_sound_runs_have_no_findings_and_their_numbers_are_reported(

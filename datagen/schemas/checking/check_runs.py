@@ -9,7 +9,7 @@ from functools import partial
 from hashlib import sha256
 from itertools import chain
 
-from datagen.schemas.checking.finding import Finding, Reseal, SetAside, below, curable, folder_of, read
+from datagen.schemas.checking.finding import RESEAL, Finding, SetAside, below, curable, folder_of, read
 from datagen.schemas.checking.records import (
     LedgerTotals,
     check_ledger,
@@ -117,9 +117,9 @@ def _read_store(storage: Storage) -> tuple[StoreRecord | None, list[Finding]]:
         record = store_record(storage)
     except InputError as error:
         problem = f"{error.field}: {error.problem}" if error.field else error.problem
-        return None, [curable(RECORD, "sealed", problem, Reseal())]
+        return None, [curable(RECORD, "sealed", problem, RESEAL)]
     if record is None and any(storage.exists(f"{name}/zarr.json") for name in claimed_names(storage)):
-        return None, [curable(RECORD, "sealed", "missing, but there is a store", Reseal())]
+        return None, [curable(RECORD, "sealed", "missing, but there is a store", RESEAL)]
     return record, []
 
 
@@ -135,11 +135,11 @@ def _check_store(storage: Storage, record: StoreRecord, runs: list[Run], is_soun
     )
     for key, problem in zip(names, checks, strict=True):
         if problem:
-            yield curable(key, "sealed", problem, Reseal())
+            yield curable(key, "sealed", problem, RESEAL)
     known = set(names)
     for file in storage.list(record.name):
         if file.key not in known and not file.key.endswith(".part"):
-            yield curable(file.key, "sealed", "is not a file of the sealed store", Reseal())
+            yield curable(file.key, "sealed", "is not a file of the sealed store", RESEAL)
     if not is_sound:
         return
     try:
@@ -154,7 +154,7 @@ def _check_store(storage: Storage, record: StoreRecord, runs: list[Run], is_soun
             yield Finding(RECORD, "lost", problem, "Make them again with `datagen resume`")
         else:
             problem = "is not of the committed shards; nothing is damaged"
-            yield curable(record.name, "stale", problem, Reseal())
+            yield curable(record.name, "stale", problem, RESEAL)
 
 
 def _lost(run: Run, part: SealedPart) -> ShardRanges:

@@ -25,25 +25,15 @@ Record = TypeVar("Record", bound=BaseModel)
 
 
 @dataclass(frozen=True)
-class Restore:
-    """Write these bytes, which come from a second copy or follow from other records."""
-
-    data: bytes
-
-
-@dataclass(frozen=True)
 class SetAside:
     """Move the finding's shard of this run out of its records, or, without a run, the finding's file."""
 
     run: Run | None = None
 
 
-@dataclass(frozen=True)
-class Reseal:
-    """Make data.zarr again."""
-
-
-Cure = Restore | SetAside | Reseal
+RESEAL = "reseal"  # make data.zarr again
+# Bytes: write them as the file. They come from a second copy, or follow from other records.
+Cure = bytes | SetAside | Literal["reseal"]
 
 
 @dataclass(frozen=True)
@@ -130,7 +120,7 @@ def compare(
         return [Finding(ours.key, "record", f"differs from its copy {copy.key}", fix, shard)]
     for bad, good in ((copy, ours), (ours, copy)):
         if good.record is not None and good.data is not None:
-            return [curable(bad.key, "record", bad.problem, Restore(good.data), shard)]
+            return [curable(bad.key, "record", bad.problem, good.data, shard)]
     damaged = [one for one in (ours, copy) if one.problem != "missing"]
     return [Finding(one.key, "record", f"{one.problem}, as is its copy", BACKUP, shard) for one in damaged]
 

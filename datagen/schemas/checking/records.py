@@ -10,7 +10,6 @@ from datagen.schemas.checking.finding import (
     AnyRecord,
     Finding,
     Kind,
-    Restore,
     SetAside,
     below,
     compare,
@@ -196,7 +195,7 @@ def _check_start(run: Run, attempt: str, shard: int) -> Iterator[Finding]:
     if start.record is not None and (start.record.attempt, start.record.shard) != (attempt, shard):
         problem = _OF_ANOTHER
     if problem:
-        known = Restore(encode_record(AttemptStart(attempt=attempt, shard=shard, started="")))
+        known = encode_record(AttemptStart(attempt=attempt, shard=shard, started=""))
         yield curable(start.key, "account", problem, known, shard)
 
 
@@ -210,9 +209,7 @@ def _check_end(run: Run, attempt: str, totals: LedgerTotals) -> Iterator[Finding
         return
     noted = end.record
     if start.record is None:
-        yield curable(
-            start.key, "account", start.problem, Restore(encode_record(start_from_end(noted))), noted.shard
-        )
+        yield curable(start.key, "account", start.problem, encode_record(start_from_end(noted)), noted.shard)
     totals.without_account += noted.cost is None
     totals.wasted_wall_s += noted.cost.wall_s if noted.cost else 0.0
 
@@ -227,7 +224,7 @@ def _check_unfinished(
     elif start.record.shard in decided:
         totals.without_account += 1
         problem = "missing, but its shard is decided; the cost is unknown"
-        cure = Restore(encode_record(lost_end(start.record, utc_now())))
+        cure = encode_record(lost_end(start.record, utc_now()))
         yield curable(end_key(attempt), "account", problem, cure, start.record.shard)
     else:
         totals.unfinished += 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -73,12 +74,9 @@ def check_shard(run: Run, commit: Commit) -> list[Finding]:
 
 def same_json(data: bytes, wanted: bytes) -> bool:
     """Whether two files are equal, up to the layout of JSON."""
-    if data == wanted:
-        return True
-    try:
-        return bool(json.loads(data) == json.loads(wanted))
-    except (ValueError, RecursionError):
-        return False
+    with suppress(ValueError, RecursionError):
+        return data == wanted or bool(json.loads(data) == json.loads(wanted))
+    return False
 
 
 def _decode(
