@@ -19,8 +19,7 @@ from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.record_files import SET_ASIDE
 from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import LedgerEntry
-from datagen.schemas.sealing import CLAIM, SEALED, seal, store_record
-from datagen.schemas.sealing.contents import RECORD
+from datagen.schemas.sealing import CLAIM, RECORD, SEALED, seal, store_record
 from datagen.schemas.storage import open_storage
 from tests.faults.crash_points_operations import remake, small_schema
 from tests.made_runs import attempt, files_of, make_run, small_spec, utc_now

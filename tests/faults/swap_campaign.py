@@ -13,8 +13,7 @@ import numpy as np
 
 from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.run_records import LedgerEntry, QuarantineRecord
-from datagen.schemas.sealing import SEALED, seal
-from datagen.schemas.sealing.contents import RECORD
+from datagen.schemas.sealing import RECORD, SEALED, seal
 from datagen.schemas.storage import open_storage
 from tests.faults.crash_points_operations import remake
 from tests.faults.damage_campaign import content, findings_at, repair_at

@@ -23,8 +23,7 @@ from datagen.schemas.jobs import Jobs
 from datagen.schemas.record_files import SET_ASIDE, commit_key, object_key, superseded_end
 from datagen.schemas.run import label_counts, open_runs
 from datagen.schemas.run_records import MAX_FILE_BYTES, Commit, foreign_field
-from datagen.schemas.sealing import CLAIM, remove_store, seal, store_record
-from datagen.schemas.sealing.contents import RECORD, SEALED
+from datagen.schemas.sealing import CLAIM, RECORD, SEALED, remove_store, seal, store_record
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage, StoredFile
 

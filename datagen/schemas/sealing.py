@@ -10,8 +10,10 @@ from __future__ import annotations
 import re
 import secrets
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from hashlib import sha256
 from itertools import chain, count, takewhile
 
 import numpy as np
@@ -20,19 +22,10 @@ from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import TABLES, Field
-from datagen.schemas.record_files import encode_record
-from datagen.schemas.run import open_runs
-from datagen.schemas.run_records import FileEntry
-from datagen.schemas.sealing.contents import (
-    RECORD,
-    SEALED,
-    Contents,
-    SealedPart,
-    StoreRecord,
-    read_contents,
-    store_record,
-)
+from datagen.schemas.fields import TABLES, Field, RecordSchema, Table
+from datagen.schemas.record_files import encode_record, read_record
+from datagen.schemas.run import Rows, Run, open_runs
+from datagen.schemas.run_records import Commit, FileEntry, Layout, SealedPart, StoreRecord
 from datagen.schemas.shard_files import (
     cf_attributes,
     described,
@@ -42,11 +35,97 @@ from datagen.schemas.shard_files import (
     with_crc32c,
     zarr_metadata,
 )
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.shard_reading import committed_place
 from datagen.schemas.storage import Storage
 from datagen.schemas.stored_arrays import Array, StoredArray, arrays_of, parse_metadata
 
-__all__ = ["SEALED", "SealedPart", "StoreRecord", "seal", "store_record"]
+SEALED = "data.zarr"
+RECORD = "data.json"
+
+
+def store_record(storage: Storage) -> StoreRecord | None:
+    """The record of the sealed store; None where there is none. InputError for a damaged one."""
+    return read_record(storage, RECORD, StoreRecord)
+
+
+@dataclass(frozen=True, eq=False)
+class SealedRun:
+    """The shards of one run that a store holds, of those that its first n samples need."""
+
+    run: Run
+    n: int
+    commits: tuple[Commit, ...]
+    is_last: bool  # the last run that has shards
+
+    def rows_of(self, commit: Commit) -> Rows:
+        """The rows of a shard in the store: whole scenes, but the store's last shard is cut to n."""
+        rows = self.run.rows_of(commit.shard, self.n)
+        if self.is_last and commit is self.commits[-1]:
+            return rows
+        return rows._replace(samples=rows.scenes * self.run.layout.candidates_per_scene)
+
+    def part(self) -> SealedPart:
+        done = ShardRanges.of(commit.shard for commit in self.commits)
+        return SealedPart(
+            spec_hash=self.run.manifest.spec_hash,
+            scenes_per_shard=self.run.layout.scenes_per_shard,
+            n=self.n,
+            samples=sum(self.rows_of(commit).samples for commit in self.commits),
+            missing=self.run.planned(self.n).without(done).ranges,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """What a store over runs holds now. `layout` is that of its largest shards, whose chunks it has."""
+
+    runs: tuple[SealedRun, ...]
+    schema: RecordSchema
+    layout: Layout
+
+    @property
+    def shards(self) -> Iterator[tuple[SealedRun, Commit, Rows]]:
+        return ((run, commit, run.rows_of(commit)) for run in self.runs for commit in run.commits)
+
+    def rows(self, table: Table) -> int:
+        return sum(rows.scenes if table == "scene" else rows.samples for _, _, rows in self.shards)
+
+    def parts(self) -> tuple[SealedPart, ...]:
+        return tuple(run.part() for run in self.runs)
+
+    def digest(self) -> str:
+        """Digest of the rows: over specification, shard, rows and object of each, in order."""
+        digest = sha256()
+        for sealed, commit, rows in self.shards:
+            spec_hash = sealed.run.manifest.spec_hash
+            digest.update(f"{spec_hash} {commit.shard} {tuple(rows)} {commit.object.sha256}\n".encode())
+        return digest.hexdigest()
+
+
+def read_contents(runs: Sequence[Run]) -> Contents:
+    """The committed planned shards of runs in order, run after run.
+
+    InputError when no shard is committed, for a damaged commit, or when the runs have different arrays.
+    """
+    first = runs[0]
+    for run in runs:
+        one, other = ((r.schema, r.layout.candidates_per_scene) for r in (first, run))
+        if one != other:
+            problem = f"has other arrays than {first.storage.url}: one store cannot hold both"
+            raise InputError(run.storage.url, "manifest.json", problem, "Read them as separate runs")
+    held: list[tuple[Run, int, tuple[Commit, ...]]] = []
+    for run in runs:
+        planned = run.planned(n := run.n)
+        held.append((run, n, tuple(commit for commit in run.commits() if commit.shard in planned)))
+    last = max((k for k, (_, _, commits) in enumerate(held) if commits), default=None)
+    if last is None:
+        place = first.storage.url
+        raise InputError(place, "commits", "no shard is committed", "Make some with `datagen resume`")
+    sealed = tuple(SealedRun(run, n, commits, k == last) for k, (run, n, commits) in enumerate(held))
+    layout = max((run.layout for run in runs), key=lambda layout: layout.scenes_per_shard)
+    return Contents(sealed, first.schema, layout)
+
 
 _ROOT = "zarr.json"
 _NUMBERED = re.compile(r"data(?:-([0-9]+))?\.zarr")
