@@ -65,17 +65,14 @@ def test_a_lost_commit_is_made_again_and_the_store_is_kept_meanwhile(tmp_path: P
     assert left.kind == "stale" and "resume --n" in left.fix and (tmp_path / "data-2.zarr").exists()
 
 
-def test_a_sound_run_is_not_changed_and_an_unfinished_one_is_sealed(tmp_path: Path) -> None:
-    sealed_run(tmp_path / "sound")
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-    repaired = repair_at(tmp_path / "sound")
-    assert (repaired.restored, repaired.set_aside, repaired.resealed) == ([], [], False)
-    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
-    run = make_run(tmp_path / "part", 48, shards=[1, 4])
-    assert repair_at(folder_of(run)).resealed and (folder_of(run) / "data.zarr/zarr.json").exists()
+def test_an_unfinished_run_is_sealed_and_a_sound_one_is_not_changed(tmp_path: Path) -> None:
+    run = make_run(tmp_path, 48, shards=[1, 4])
+    assert repair_at(tmp_path).resealed
+    before = files_of(tmp_path)
+    assert not repair_at(tmp_path).resealed and files_of(tmp_path) == before
     for shard in (1, 4):
-        flip(folder_of(run) / f"shards/a-{shard}.zip")
-    assert [f.kind for f in repair_at(folder_of(run)).left] == ["lost"] and run.committed() == set()
+        flip(tmp_path / f"shards/a-{shard}.zip")
+    assert [f.kind for f in repair_at(tmp_path).left] == ["lost"] and run.committed() == set()
 
 
 def test_a_store_that_cannot_be_made_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import FileEntry, Layout, LedgerEntry, StageClock
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import open_storage
-from tests.made_runs import commit_of, files_of, give_up, make_run, manifest_of, small_spec, write
+from tests.made_runs import commit_of, files_of, make_run, manifest_of, small_spec, write
 from tests.schemas.checked import edit
 
 pytestmark = pytest.mark.usefixtures("few_arrays")
@@ -68,14 +68,6 @@ def test_another_specification_is_refused_with_every_differing_field(tmp_path: P
     assert files_of(tmp_path) == before
 
 
-def test_of_racing_committers_one_wins_and_the_run_holds_its_attempt(tmp_path: Path) -> None:
-    run = make_run(tmp_path, shards=[])
-    commits = [write(run, 0, f"attempt-{i}") for i in range(4)]
-    with ThreadPoolExecutor(4) as pool:
-        won = list(pool.map(run.commit, commits))
-    assert sum(won) == 1 and Run.open(tmp_path).commit_of(0).attempt == f"attempt-{won.index(True)}"
-
-
 def test_an_object_is_written_once_and_read_as_committed(tmp_path: Path) -> None:
     run = make_run(tmp_path, shards=[])
     commit = write(run, 0, "a")
@@ -103,16 +95,6 @@ def test_the_ledger_knows_who_began_and_who_never_ended(tmp_path: Path) -> None:
     assert (entry.outcome, len(entry.stack)) == ("crashed", 20_000)
     assert [s.attempt for s in run.ledger.unfinished({"c"})] == ["b"]
     assert run.ledger.end(end.model_copy(update={"attempt": "d"})) and run.ledger.attempts() == set("abcd")
-
-
-def test_quarantine_takes_a_shard_from_the_missing_until_it_is_committed(tmp_path: Path) -> None:
-    run = make_run(tmp_path, n=30, shards=[0])
-    give_up(run, 2, "c")
-    (record,) = run.quarantine_records()
-    assert not run.quarantine(record.model_copy(update={"created": "later"}))
-    assert (run.missing(), run.quarantined(), record.causes) == ([1], {2}, ("c",))
-    assert run.commit(write(run, 2, "again"))
-    assert (run.missing(), run.quarantined()) == ([1], set())
 
 
 def test_other_names_in_commits_do_not_count(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from datagen.schemas import shard_files, stored_arrays
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
-from datagen.schemas.run import Run, open_runs
+from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
 from datagen.schemas.sealing import seal, store_record
 from datagen.schemas.shard_reading import ZipFiles
@@ -34,10 +34,8 @@ from tests.schemas.checked import (
     dies_at,
     edit,
     expected,
-    fill,
     folder_of,
     found,
-    merge,
     of,
     stored,
 )  # fmt: skip
@@ -120,22 +118,6 @@ def test_missing_shards_are_left_out_and_named_also_of_a_trillion(tmp_path: Path
     record = store_record(run.storage)
     assert record is not None and record.parts[0].samples == 20
     assert record.parts[0].missing == ((0, 1), (2, 4), (5, 10**11))
-
-
-def test_parts_follow_each_other_and_only_the_end_is_cut(tmp_path: Path) -> None:
-    for seed, (who, shards) in enumerate({"a": [0, 1, 2], "b": [0, 2], "c": [0, 1, 2], "d": []}.items()):
-        fill(tmp_path, who, shards, n=23, seed=seed)
-    merge(tmp_path, "abcd")
-    runs = [run for run in open_runs(tmp_path / "out") if run.committed()]
-    # Of the last scene three samples are wanted, but scenes are whole in all parts but the last.
-    each = [
-        expected(of(run, *sorted(run.committed())), scenes := 2 * len(run.committed()) - 1, 5 * scenes)
-        for run in runs
-    ]
-    is_sample = {f.name for f in runs[0].schema.sample_fields}
-    wanted = {name: np.concatenate([rows[name] for rows in each]) for name in each[0]}
-    wanted = {name: values[:-2] if name in is_sample else values for name, values in wanted.items()}
-    assert_rows(stored(open_storage(tmp_path / "out")), wanted)
 
 
 def test_nothing_committed_damaged_shards_and_links_are_refused_and_leave_the_old_store(

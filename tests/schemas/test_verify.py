@@ -15,7 +15,6 @@ from datagen.schemas.checking.finding import Finding, SetAside
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import RecordSchema
 from datagen.schemas.jobs import JobRecord, Jobs, JobState, new_job_id
-from datagen.schemas.quarantine import lift_quarantine
 from datagen.schemas.record_files import (
     commit_key,
     decode_record,
@@ -261,18 +260,3 @@ def test_waste_adds_up_and_attempts_are_lost_once_their_shards_are_decided(tmp_p
     starts = {start.attempt: start for start in run.ledger.unfinished({"a-1"})}
     for entry in (restored(finding, LedgerEntry) for finding in findings):
         assert entry == lost_end(starts[entry.attempt], entry.ended)
-
-
-def test_quarantine_records_of_others_are_found_and_half_written_or_lifted_are_not(tmp_path: Path) -> None:
-    run = make_run(tmp_path, shards=[1])
-    run.quarantine(QUARANTINED)
-    run.storage.put("quarantine/000004.json.part", b"{")
-    assert found(tmp_path) == []
-    path = tmp_path / "quarantine/000003.json"
-    other = path.rename(path.with_name("000004.json"))
-    assert found(tmp_path) == [("record", "quarantine/000004.json")]
-    other.rename(path)
-    edit(path, seed=7)
-    assert found(tmp_path) == [("record", "quarantine/000003.json")]
-    edit(path, seed=0)
-    assert lift_quarantine(run) == [3] and found(tmp_path) == []
