@@ -153,16 +153,14 @@ def refuse_foreign(storage: Storage, *also: str) -> None:
 
 def refuse_other(place: str, stored: Manifest, given: Manifest) -> None:
     """Raise InputError for a run of another specification, with every field that differs."""
-    ours, theirs = (
-        {"spec": one.spec.model_dump(mode="json"), "schema_name": one.schema_name} for one in (given, stored)
-    )
-    rows = different_fields(ours, theirs)
     where, each = f"{place}/manifest.json", stored.layout.candidates_per_scene
     if each != given.layout.candidates_per_scene:
         problem = f"is {each}, not {given.layout.candidates_per_scene}"
         raise InputError(where, "layout.candidates_per_scene", problem, "Choose another --out")
+    ours, theirs = ({**m.spec.document(), "schema_name": m.schema_name} for m in (given, stored))
+    rows = different_fields(ours, theirs)
     if rows:
-        shown = [f"{path.removeprefix('spec.')}: {b!r}, but {a!r} was given" for path, a, b in rows[:20]]
+        shown = [f"{path}: {b!r}, but {a!r} was given" for path, a, b in rows[:20]]
         more = f"; and {len(rows) - 20} more" if len(rows) > 20 else ""
         problem = "has another specification (" + "; ".join(shown) + more + ")"
         raise InputError(where, "", problem, "Choose another --out, or give the same options")

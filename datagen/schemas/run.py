@@ -159,20 +159,19 @@ class Run:
 
     # Shards and commits.
 
+    def counted(self, n: int) -> ShardRanges:
+        """The scenes that count among those of the first n samples."""
+        scenes = ShardRanges.of(range(-(-n // self.layout.candidates_per_scene)))
+        return scenes if self.scenes is None else scenes.within(self.scenes)
+
     def planned(self, n: int | None = None) -> ShardRanges:
         """The shards whose rows count among the first n samples [the wanted ones]."""
-        n = self.n if n is None else n
-        if self.scenes is None:
-            return ShardRanges.of(range(self.layout.shards_for(n)))
-        scenes = ShardRanges.of(range(-(-n // self.layout.candidates_per_scene)))
-        return self.scenes.within(scenes).blocks(self.layout.scenes_per_shard)
+        return self.counted(self.n if n is None else n).blocks(self.layout.scenes_per_shard)
 
     def samples_wanted(self, n: int) -> int:
         """Of the first n samples those that count."""
-        if self.scenes is None:
-            return n
         each = self.layout.candidates_per_scene
-        return sum(min(past * each, n) - min(first * each, n) for first, past in self.scenes.ranges)
+        return sum(min(past * each, n) - min(first * each, n) for first, past in self.counted(n).ranges)
 
     def rows_of(self, shard: int, n: int) -> Rows:
         """The rows of a shard that count among the first n samples; the last shard may be cut."""
@@ -319,8 +318,7 @@ def find_scene(runs: Sequence[Run], scene: int) -> tuple[Run, int]:
     """
     left = scene
     for run in runs:
-        scenes = ShardRanges.of(range(-(-run.n // run.layout.candidates_per_scene)))
-        scenes = scenes if run.scenes is None else scenes.within(run.scenes)
+        scenes = run.counted(run.n)
         if 0 <= left < len(scenes):
             return run, scenes[left]
         left -= len(scenes)

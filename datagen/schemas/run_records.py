@@ -207,11 +207,10 @@ class Commit(StoredRecord):
 
 def foreign_field(manifest: Manifest, shard: int, commit: Commit) -> tuple[str, str] | None:
     """(field, problem) where a commit cannot belong to this shard of the run; else None."""
-    layout, path = manifest.layout, f"{commit.attempt}.zip"
+    layout = manifest.layout
     expected = {"shard": shard, "spec_hash": manifest.spec_hash, "scenes": layout.scenes_per_shard}
-    return other_value(commit, **expected, samples=layout.samples_per_shard) or other_value(
-        commit.object, path=path
-    )
+    found = other_value(commit, **expected, samples=layout.samples_per_shard)
+    return found or other_value(commit.object, path=f"{commit.attempt}.zip")
 
 
 def other_value(record: StoredRecord, **expected: object) -> tuple[str, str] | None:

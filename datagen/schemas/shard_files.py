@@ -25,8 +25,7 @@ from zarr.codecs import BytesCodec, Crc32cCodec, VLenUTF8Codec, ZstdCodec
 from zarr.storage import MemoryStore
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import TABLES, Field, RecordSchema, Table
-from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.fields import REDRAW_CAUSES, TABLES, Field, RecordSchema, Table
 from datagen.schemas.run_records import Layout
 from datagen.schemas.specification import Specification
 

@@ -24,9 +24,8 @@ from datagen.schemas.checking.records import (
     open_roots,
 )
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import Field, Table
+from datagen.schemas.fields import REDRAW_CAUSES, Field, Table
 from datagen.schemas.identity import sample_ids
-from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.record_files import commit_key, object_key
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, SealedPart, StoreRecord, foreign_field

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -19,7 +20,6 @@ from datagen.schemas.checking.finding import (
     sound,
 )
 from datagen.schemas.errors import InputError
-from datagen.schemas.quarantine import name_before
 from datagen.schemas.record_files import (
     MERGED,
     copy_key,
@@ -50,6 +50,7 @@ from datagen.schemas.storage import Storage
 
 _MANIFEST = "manifest.json"
 _BROKEN_OFF = "Merge the runs again: it finishes a merge that was interrupted"
+_LIFTED = re.compile(r"\.lifted-[1-9][0-9]{0,8}\.json\Z")  # a record whose shard was released
 _OF_ANOTHER = "is the record of another"
 
 
@@ -249,7 +250,7 @@ def check_quarantine(run: Run) -> Iterator[Finding]:
         problem = record.problem
         if record.record is not None:
             shard = record.record.shard
-            problem = _misnamed(f"{shard:06d}.json", name_before(name))
+            problem = _misnamed(f"{shard:06d}.json", _LIFTED.sub(".json", name))
             first, seed = shard * run.layout.scenes_per_shard, run.manifest.spec.seed
             problem = problem or ": ".join(other_value(record.record, seed=seed, first_scene=first) or ())
         if problem:
