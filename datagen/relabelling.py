@@ -162,7 +162,7 @@ def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips:
     with clock.stage("draw"):
         before = source.commit_of(task.shard)
         place = committed_place(source, before)
-        stored = place.read(place.metadata(_READ).values())
+        stored = place.read(place.source.metadata(_READ).values())
         kept = ZipFiles(place.url, source.read_object(before))
     with clock.stage("visibility"):
         made = _relabelled(run, stored)

@@ -37,7 +37,10 @@ Wanted = Sequence[tuple[StoredArray, int]]  # chunks, each as its array and its 
 
 
 class Source(Protocol):
-    """Where arrays lie: `chunks` are (address, bytes), in the order of the wanted ones."""
+    """Where arrays lie: `chunks` are (address, bytes), in the order of the wanted ones.
+
+    InputError for a missing, foreign or damaged file.
+    """
 
     @property
     def url(self) -> str: ...
@@ -177,10 +180,6 @@ class ShardPlace:
     def url(self) -> str:
         return self.source.url
 
-    def metadata(self, names: Sequence[str]) -> dict[str, StoredArray]:
-        """Read the metadata of the named arrays. InputError for a missing, foreign or damaged file."""
-        return self.source.metadata(names)
-
     def read(self, arrays: Iterable[StoredArray]) -> dict[str, Array]:
         """Read the wanted rows of each array. InputError for a missing, foreign or damaged file."""
         wanted = {array.name: array for array in arrays}
@@ -230,7 +229,7 @@ def read_committed(
 ) -> dict[str, Array]:
     """Read rows [all] of the named arrays of a committed shard. InputError as `ShardPlace.read`."""
     place = committed_place(run, commit, rows)
-    return place.read(place.metadata(names).values())
+    return place.read(place.source.metadata(names).values())
 
 
 def read_scene(run: Run, scene: int) -> SceneRows:
@@ -255,13 +254,6 @@ def read_scenes(run: Run, scenes: Iterable[int]) -> Iterator[SceneRows]:
             record={f.name: arrays[f.name][row] for f in run.schema.scene_fields},
             samples={f.name: arrays[f.name][rows] for f in run.schema.sample_fields},
         )
-
-
-def committed_scenes(run: Run) -> int:
-    """Number of scenes before the first missing shard, including those beyond n in the last shard."""
-    committed = run.committed()
-    shards = next(k for k in range(len(committed) + 1) if k not in committed)
-    return shards * run.layout.scenes_per_shard
 
 
 def read_shard(run: Run, shard: int) -> dict[str, Array]:

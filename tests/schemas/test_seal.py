@@ -160,27 +160,22 @@ def test_an_up_to_date_store_is_not_written_and_a_grown_run_switches_to_another(
     assert seal(run.storage) == f"{tmp_path}/data-4.zarr"  # another process may still remove those before
 
 
-@pytest.fixture
-def tiny_disk(tmp_path: Path) -> Iterator[Path]:
+def test_a_disk_that_fills_up_keeps_what_is_committed_and_continues_with_room(tmp_path: Path) -> None:
     with small_disk(tmp_path / "tiny", "512k") as disk:
-        yield disk
-
-
-def test_a_disk_that_fills_up_keeps_what_is_committed_and_continues_with_room(tiny_disk: Path) -> None:
-    run = make_run(tiny_disk, n=1, shards=[])
-    run.grow(3000)
-    with pytest.raises(InputError, match=r"No space left on device\. Free disk space"):
-        for shard in run.missing():
-            assert run.commit(write(run, shard, f"a-{shard}"))
-    done = sorted(run.committed())
-    assert done and all(run.read_object(commit) for commit in Run.open(tiny_disk).commits())
-    with pytest.raises(InputError, match="No space left on device"):
-        seal(run.storage)
-    assert list(tiny_disk.glob("data*")) == []
-    subprocess.run(["mount", "-o", "remount,size=64m", str(tiny_disk)], check=True)
-    assert run.commit(write(run, len(done), "b"))
-    assert seal(run.storage) == f"{tiny_disk}/data.zarr"
-    assert_rows(stored(run.storage), expected(of(run, *done, len(done))))
+        run = make_run(disk, n=1, shards=[])
+        run.grow(3000)
+        with pytest.raises(InputError, match=r"No space left on device\. Free disk space"):
+            for shard in run.missing():
+                assert run.commit(write(run, shard, f"a-{shard}"))
+        done = sorted(run.committed())
+        assert done and all(run.read_object(commit) for commit in Run.open(disk).commits())
+        with pytest.raises(InputError, match="No space left on device"):
+            seal(run.storage)
+        assert list(disk.glob("data*")) == []
+        subprocess.run(["mount", "-o", "remount,size=64m", str(disk)], check=True)
+        assert run.commit(write(run, len(done), "b"))
+        assert seal(run.storage) == f"{disk}/data.zarr"
+        assert_rows(stored(run.storage), expected(of(run, *done, len(done))))
 
 
 @pytest.mark.parametrize("place", ["disk", "s3"])
