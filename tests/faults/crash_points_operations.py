@@ -101,7 +101,7 @@ def damage(folder: Path, places: Iterable[str] = ("",)) -> list[str]:
         for place in places
         if (folder / place).exists()
         for finding in check_runs(open_storage(folder / place, probe=False), Checked())
-        if finding.is_damage
+        if finding.kind != "stale"
     ]
 
 

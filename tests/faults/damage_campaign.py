@@ -159,7 +159,7 @@ def try_all(
         campaign.tried[damage.kind] += 1
         name = f"{damage.kind} {damage.key}"
         undo = apply(scratch, damage)
-        if not [f for f in findings_at(scratch) if f.is_damage]:
+        if not [f for f in findings_at(scratch) if f.kind != "stale"]:
             campaign.missed.append(name)
         if number % repair_every:
             undo()

@@ -47,11 +47,6 @@ class Finding:
     shard: int | None = None
     cure: Cure | None = None
 
-    @property
-    def is_damage(self) -> bool:
-        """Whether data is damaged; an outdated sealed store is not damage."""
-        return self.kind != "stale"
-
 
 def below(prefix: str, findings: Iterable[Finding]) -> Iterator[Finding]:
     """The findings with keys relative to the merged runs, which hold their run in the folder `prefix`."""
