@@ -136,9 +136,9 @@ def _reseal(storage: Storage, result: Repaired) -> bool:
     if kinds <= {*_HARMLESS, *({"lost"} if "sealed" in kinds else ())}:
         try:
             runs = open_runs(storage)
-            if any(ShardRanges.of(run.committed()).without(run.planned()) for run in runs if not run.scenes):
-                why = "More shards are committed than wanted: raise the number with `datagen resume --n`"
-            else:
+            if not any(
+                ShardRanges.of(run.committed()).without(run.planned()) for run in runs if not run.scenes
+            ):
                 result.resealed = True
                 has_labels = label_counts(runs).labels > 0
                 if "sealed" in kinds:  # an undamaged store is replaced once the new one is written
@@ -146,13 +146,13 @@ def _reseal(storage: Storage, result: Repaired) -> bool:
                 if has_labels:
                     seal(storage)
                 return result.checked.is_sealed or has_labels
+            why = "More shards are committed than wanted: raise the number with `datagen resume --n`"
         except InputError as error:
             why = str(error)
-    kept = [finding for finding in result.left if finding.cure != RESEAL]
-    outdated = [replace(finding, fix=why, cure=None) for finding in result.left if finding not in kept]
-    if not result.left:
-        outdated = [Finding(SEALED, "sealed", "cannot be made", why)]
-    result.left = [*kept, *outdated]
+    for number, finding in enumerate(result.left):
+        if finding.cure == RESEAL:
+            result.left[number] = replace(finding, fix=why, cure=None)
+    result.left = result.left or [Finding(SEALED, "sealed", "cannot be made", why)]
     return False
 
 

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -220,15 +221,12 @@ def concurrent_map(
     The first exception ends it; no call is running after the iterator has ended. `items` is consumed in the
     caller's thread, as needed. `do` must not wait for the pool that it runs in.
     """
-    begun: deque[Future[Result]] = deque()
+    begun, left = deque[Future[Result]](), iter(items)
     try:
-        for item in items:
-            begun.append(pool.submit(do, item))
-            if len(begun) >= most:
-                result = begun[0].result()
-                begun.popleft()
-                yield result
-        while begun:
+        while True:
+            begun.extend(pool.submit(do, item) for item in islice(left, most - len(begun)))
+            if not begun:
+                return
             result = begun[0].result()
             begun.popleft()
             yield result
