@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import zarr
 
-from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.sealing import SEALED
 from datagen.workers.geometry.mesh import F64
 

@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw
 from benchmarks.repeatability import stored_scenes
 from datagen.drawing.film import Film, filmstrip_moments
 from datagen.drawing.posed_robot import robot_bodies
-from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import Specification

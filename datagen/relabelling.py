@@ -29,8 +29,7 @@ from datagen.schemas.run_records import Commit, StageClock
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_files import encode_array, group_metadata, zipped
 from datagen.schemas.shard_ranges import ShardRanges
-from datagen.schemas.shard_reading import committed_place
-from datagen.schemas.shard_sources import ZipFiles
+from datagen.schemas.shard_reading import ZipFiles, committed_place
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import Storage
 from datagen.workers.labels import distance_visibility_score as formula
@@ -163,7 +162,7 @@ def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips:
     with clock.stage("draw"):
         before = source.commit_of(task.shard)
         place = committed_place(source, before)
-        stored = place.read(place.metadata(_READ).values())
+        stored = place.read(place.source.metadata(_READ).values())
         kept = ZipFiles(place.url, source.read_object(before))
     with clock.stage("visibility"):
         made = _relabelled(run, stored)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from datagen.schemas.fields import SCHEMA_VERSION, SCHEMAS, Field, RecordSchema
-from datagen.schemas.outcomes import OUTCOMES, REDRAW_CAUSES
+from datagen.schemas.fields import OUTCOMES, REDRAW_CAUSES, SCHEMA_VERSION, SCHEMAS, Field, RecordSchema
 from datagen.schemas.run_records import FORMAT_VERSION
 from datagen.schemas.shard_files import CONVENTIONS, MAX_CHUNK_BYTES, ZSTD_LEVEL
 

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from datagen.schemas.fields import Field, RecordSchema, sized_schema
+from datagen.schemas.fields import REDRAW_CAUSES, Field, RecordSchema, sized_schema
 from datagen.schemas.identity import sample_ids
-from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.record_files import commit_key, encode_record, object_key, utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import (
@@ -24,7 +23,7 @@ from datagen.schemas.run_records import (
     QuarantineRecord,
 )
 from datagen.schemas.shard_files import encode_shard, zipped
-from datagen.schemas.shard_sources import ZipFiles
+from datagen.schemas.shard_reading import ZipFiles
 from datagen.schemas.specification import ObservationParams, SceneParams, Source, Specification
 from datagen.schemas.storage import open_storage
 

@@ -12,9 +12,8 @@ from datagen.console.options import AsJson, AssetSources, RunPath, Sources, Whol
 from datagen.console.printing import counted, listed, print_json, print_lines, print_rows, seconds, size
 from datagen.display.progress import counting
 from datagen.schemas.checking.check_runs import Checked, check_runs
-from datagen.schemas.checking.cleaning import Cleaned, clean_runs, refuse_running
 from datagen.schemas.checking.finding import Finding
-from datagen.schemas.checking.repair import Repaired, repair_runs
+from datagen.schemas.checking.repair import Cleaned, Repaired, clean_runs, refuse_running, repair_runs
 from datagen.schemas.errors import InputError, printable
 from datagen.schemas.storage import Storage, open_storage
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from datagen.configuration.specify import (
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
-from datagen.schemas.shard_reading import committed_scenes
 from datagen.schemas.specification import Specification
 from datagen.workers.engine_versions import ARM_PACKAGES, label_engines, scene_engine_names
 from datagen.workers.robots import remember
@@ -43,7 +43,8 @@ class StoredScenes:
 
     def available(self) -> int:
         """Number of candidates in the scenes before the first missing shard."""
-        return committed_scenes(self.run) * self.candidates_per_scene
+        committed = self.run.committed()
+        return next(k for k in count() if k not in committed) * self.run.layout.samples_per_shard
 
 
 def open_stored_scenes(

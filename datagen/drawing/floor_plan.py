@@ -24,7 +24,7 @@ from datagen.display.styles import (
     TARGET,
     Style,
 )
-from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.fields import OUTCOMES
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import convex_hull
 from datagen.workers.houses.house import StaticBody

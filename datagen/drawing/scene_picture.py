@@ -13,9 +13,8 @@ import numpy as np
 from datagen.display.figures import draw_frame, new_sheet, save_sheet, write_facts
 from datagen.display.styles import BEST, BEST_BY_SCORE
 from datagen.drawing.floor_plan import draw_candidates, draw_legend, draw_pick, draw_plan, draw_scores
-from datagen.schemas.fields import SceneRows
+from datagen.schemas.fields import OUTCOMES, REDRAW_CAUSES, SceneRows
 from datagen.schemas.identity import Stream, generator
-from datagen.schemas.outcomes import OUTCOMES, REDRAW_CAUSES
 from datagen.schemas.specification import Specification
 from datagen.workers.rendering import Frame
 from datagen.workers.scenes.generate import render_frame

@@ -12,7 +12,7 @@ from datagen.drawing.film import Film, filmstrip_moments, write_animation, write
 from datagen.drawing.posed_robot import robot_bodies
 from datagen.drawing.scene_picture import Lines, Shown, best_success
 from datagen.schemas.errors import InputError
-from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import SceneCandidates

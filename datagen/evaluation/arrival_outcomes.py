@@ -22,8 +22,8 @@ import numpy as np
 from datagen.cluster.environment import changed_environment
 from datagen.display.progress import counting
 from datagen.schemas.errors import InputError
+from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.identity import Stream, digest_of, generator
-from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.safe_files import read_regular, whole_file

@@ -20,7 +20,7 @@ from datagen.evaluation.comparisons import (
 )
 from datagen.evaluation.grids import picks, select
 from datagen.schemas.errors import InputError
-from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.fields import OUTCOMES
 from datagen.train import metrics
 from datagen.train.bootstrap import (
     Estimate,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.shard_reading import read_committed

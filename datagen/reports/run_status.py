@@ -7,7 +7,8 @@ from typing import Any
 
 from datagen.schemas.quarantine import lifted_records
 from datagen.schemas.run import Run, open_runs
-from datagen.schemas.sealing import StoreRecord, store_record
+from datagen.schemas.run_records import StoreRecord
+from datagen.schemas.sealing import store_record
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage
 
@@ -44,7 +45,7 @@ def status_report(run: Run, store: StoreRecord | None = None, stacks: bool = Fal
             causes[cause] += 1
             examples.setdefault(cause, entry.attempt)
     store = store or store_record(run.storage)
-    absent, part = planned.without(committed), store.part_of(run) if store else None
+    absent, part = planned.without(committed), store.part_of(run.manifest) if store else None
     common = dict(causes.most_common(_SHOWN))
     report: dict[str, Any] = {
         "run": run.storage.url,

@@ -46,11 +46,5 @@ def lifted_records(run: Run) -> list[QuarantineRecord]:
     return records
 
 
-def name_before(name: str) -> str:
-    """The file name of a record in `quarantine/` before its shard was released."""
-    lifted = _LIFTED.fullmatch(f"quarantine/{name}")
-    return f"{lifted[1]}.json" if lifted else name
-
-
 def _lifted_key(shard: int, k: int) -> str:
     return f"quarantine/{shard:06d}.lifted-{k}.json"

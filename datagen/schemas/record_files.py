@@ -153,16 +153,14 @@ def refuse_foreign(storage: Storage, *also: str) -> None:
 
 def refuse_other(place: str, stored: Manifest, given: Manifest) -> None:
     """Raise InputError for a run of another specification, with every field that differs."""
-    ours, theirs = (
-        {"spec": one.spec.model_dump(mode="json"), "schema_name": one.schema_name} for one in (given, stored)
-    )
-    rows = different_fields(ours, theirs)
     where, each = f"{place}/manifest.json", stored.layout.candidates_per_scene
     if each != given.layout.candidates_per_scene:
         problem = f"is {each}, not {given.layout.candidates_per_scene}"
         raise InputError(where, "layout.candidates_per_scene", problem, "Choose another --out")
+    ours, theirs = ({**m.spec.document(), "schema_name": m.schema_name} for m in (given, stored))
+    rows = different_fields(ours, theirs)
     if rows:
-        shown = [f"{path.removeprefix('spec.')}: {b!r}, but {a!r} was given" for path, a, b in rows[:20]]
+        shown = [f"{path}: {b!r}, but {a!r} was given" for path, a, b in rows[:20]]
         more = f"; and {len(rows) - 20} more" if len(rows) > 20 else ""
         problem = "has another specification (" + "; ".join(shown) + more + ")"
         raise InputError(where, "", problem, "Choose another --out, or give the same options")
@@ -250,28 +248,14 @@ def lost_end(start: AttemptStart, ended: str = "", cause: str = LOST_CAUSE) -> L
 
     It is a guess, made once the shard is decided: the attempt, if still running, may replace it.
     """
-    return LedgerEntry(
-        attempt=start.attempt,
-        shard=start.shard,
-        outcome="lost",
-        cause=cause,
-        started=start.started,
-        ended=ended,
-    )
+    named = {name: getattr(start, name) for name in ("attempt", "shard", "started")}
+    return LedgerEntry(outcome="lost", cause=cause, ended=ended, **named)
 
 
 def superseded_end(commit: Commit, cause: str, started: str = "") -> LedgerEntry:
     """The end record of an attempt whose commit does not count any more, with the commit's cost."""
-    return LedgerEntry(
-        attempt=commit.attempt,
-        shard=commit.shard,
-        outcome="superseded",
-        cause=cause,
-        started=started,
-        ended=commit.created,
-        cost=commit.cost,
-        host=commit.host,
-    )
+    kept = {name: getattr(commit, name) for name in ("attempt", "shard", "cost", "host")}
+    return LedgerEntry(outcome="superseded", cause=cause, started=started, ended=commit.created, **kept)
 
 
 def start_from_end(end: LedgerEntry) -> AttemptStart:

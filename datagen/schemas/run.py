@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
@@ -133,52 +132,46 @@ class Run:
 
     @property
     def n(self) -> int:
-        return self._newest_plan()[1]
+        plan = self.plan()
+        return plan.n if plan else 0
 
     def grow(self, n: int, created: str | None = None) -> None:
         """Raise the wanted samples to n; a run never shrinks. `created` is the plan's time [now]."""
         if not 1 <= n <= MOST_SAMPLES:
             raise InputError("--n", str(n), "is not between 1 and 10^12", "Give the number of samples wanted")
-        while True:
-            number, wanted = self._newest_plan()
-            if wanted >= n:
-                return
-            number, spec_hash = number + 1, self.manifest.spec_hash
+        while (newest := self.plan()) is None or newest.n < n:
+            number, spec_hash = newest.number + 1 if newest else 1, self.manifest.spec_hash
             plan = Plan(n=n, created=created or utc_now(), spec_hash=spec_hash, number=number)
             # Where another plan appeared meanwhile, read the newest again.
             publish(self.storage, f"plans/{number}.json", encode_record(plan))
 
     def plan(self) -> Plan | None:
         """The newest plan; None where the first one is not written yet."""
-        number, _ = self._newest_plan()
-        return read_record(self.storage, f"plans/{number}.json", Plan) if number else None
-
-    def _newest_plan(self) -> tuple[int, int]:
-        numbers = self._numbers("plans", width=1)
+        numbers = self.numbers("plans", width=1)
         if not numbers:
-            return 0, 0
-        number = max(numbers)
-        plan = read_record(self.storage, key := f"plans/{number}.json", Plan)
-        if plan and (found := other_value(plan, spec_hash=self.manifest.spec_hash, number=number)):
+            return None
+        plan = read_record(self.storage, key := f"plans/{max(numbers)}.json", Plan)
+        if plan is None:  # removed since the listing
+            return self.plan()
+        if found := other_value(plan, spec_hash=self.manifest.spec_hash, number=max(numbers)):
             raise InputError(f"{self.storage.url}/{key}", *found, REPAIR)
-        return (number, plan.n) if plan else self._newest_plan()
+        return plan
 
     # Shards and commits.
 
+    def counted(self, n: int) -> ShardRanges:
+        """The scenes that count among those of the first n samples."""
+        scenes = ShardRanges.of(range(-(-n // self.layout.candidates_per_scene)))
+        return scenes if self.scenes is None else scenes.within(self.scenes)
+
     def planned(self, n: int | None = None) -> ShardRanges:
         """The shards whose rows count among the first n samples [the wanted ones]."""
-        n = self.n if n is None else n
-        if self.scenes is None:
-            return ShardRanges.of(range(self.layout.shards_for(n)))
-        scenes = ShardRanges.of(range(-(-n // self.layout.candidates_per_scene)))
-        return self.scenes.within(scenes).blocks(self.layout.scenes_per_shard)
+        return self.counted(self.n if n is None else n).blocks(self.layout.scenes_per_shard)
 
     def samples_wanted(self, n: int) -> int:
         """Of the first n samples those that count."""
-        if self.scenes is None:
-            return n
         each = self.layout.candidates_per_scene
-        return sum(min(past * each, n) - min(first * each, n) for first, past in self.scenes.ranges)
+        return sum(min(past * each, n) - min(first * each, n) for first, past in self.counted(n).ranges)
 
     def rows_of(self, shard: int, n: int) -> Rows:
         """The rows of a shard that count among the first n samples; the last shard may be cut."""
@@ -192,37 +185,31 @@ class Run:
         return Rows(first, past - first, min(past * each, samples) - min(first * each, samples))
 
     def committed(self) -> set[int]:
-        return self._numbers("commits")
+        return self.numbers("commits")
 
     def missing(self) -> ShardRanges:
         """Planned shards that are neither committed nor quarantined, in order."""
-        decided = self._numbers("commits") | self._numbers("quarantine")
+        decided = self.numbers("commits") | self.numbers("quarantine")
         return self.planned().without(ShardRanges.of(decided))
 
     def commit_of(self, shard: int) -> Commit:
         """The commit record of a committed shard, checked against the manifest."""
-        key = commit_key(shard)
-        data = self.storage.get(key, MAX_RECORD_BYTES)
-        if data is None:
-            place = f"{self.storage.url}/{key}"
-            raise InputError(place, "", "no such commit", "Make the shard with `datagen resume`")
-        return self.decode_commit(shard, data)
-
-    def decode_commit(self, shard: int, data: bytes) -> Commit:
-        """The commit record in the bytes of a shard's file, checked against the manifest."""
+        for commit in self.commits([shard]):
+            return commit
         place = f"{self.storage.url}/{commit_key(shard)}"
-        commit = decode_record(place, data, Commit)
-        if (found := foreign_field(self.manifest, shard, commit)) is not None:
-            raise InputError(place, *found, "Remove this foreign commit")
-        return commit
+        raise InputError(place, "", "no such commit", "Make the shard with `datagen resume`")
 
-    def commits(self) -> Iterator[Commit]:
-        shards = sorted(self.committed())
-        for shard, (_, data) in zip(
-            shards, self.storage.get_many(map(commit_key, shards), MAX_RECORD_BYTES), strict=True
-        ):
-            if data is not None:  # else it was removed since the listing
-                yield self.decode_commit(shard, data)
+    def commits(self, shards: Iterable[int] | None = None) -> Iterator[Commit]:
+        """The commits that shards [all committed] have, checked against the manifest."""
+        shards = sorted(self.committed()) if shards is None else list(shards)
+        files = self.storage.get_many(map(commit_key, shards), MAX_RECORD_BYTES)
+        for shard, (key, data) in zip(shards, files, strict=True):
+            if data is not None:
+                place = f"{self.storage.url}/{key}"
+                commit = decode_record(place, data, Commit)
+                if (found := foreign_field(self.manifest, shard, commit)) is not None:
+                    raise InputError(place, *found, "Remove this foreign commit")
+                yield commit
 
     def write_object(self, attempt: str, data: bytes) -> FileEntry:
         """Write an attempt's rows durably, and return the entry for its commit."""
@@ -239,19 +226,19 @@ class Run:
         """Commit a shard whose object is written. False where another attempt is, and the object is spare."""
         return self.storage.put_new(commit_key(commit.shard), encode_record(commit))
 
-    def read_object(self, commit: Commit) -> bytes:
-        """The committed bytes of a shard's rows. InputError where they are missing or have another sha256."""
-        return self.read_rows(commit.object)
+    def read_object(self, commit: Commit, check: bool = True) -> bytes:
+        """The committed bytes of a shard's rows; without `check`, not compared with their sha256.
 
-    def read_rows(self, entry: FileEntry, check: bool = True) -> bytes:
-        """The bytes of the object in a commit; without `check`, not compared with its sha256."""
+        InputError where they are missing or have another sha256.
+        """
+        entry = commit.object
         data = self.storage.get(key := f"shards/{entry.path}", entry.size)
-        problem = "no such file" if data is None else ""
-        if data is not None and check and sha256(data).hexdigest() != entry.sha256:
+        problem = "no such file"
+        if data is not None:
+            if not check or sha256(data).hexdigest() == entry.sha256:
+                return data
             problem = f"has {len(data)} bytes with another sha256 than the commit"
-        if data is None or problem:
-            raise InputError(f"{self.storage.url}/{key}", "", problem, REPAIR)
-        return data
+        raise InputError(f"{self.storage.url}/{key}", "", problem, REPAIR)
 
     def close_lost_attempts(self, ended: str = "") -> int:
         """End attempts without an end, as lost, whose shard is decided without them; return their number."""
@@ -272,14 +259,14 @@ class Run:
 
     def quarantined(self) -> set[int]:
         """Quarantined shards, by listing. A shard that was committed later counts as committed."""
-        return self._numbers("quarantine") - self.committed()
+        return self.numbers("quarantine") - self.committed()
 
     def quarantine_records(self) -> list[QuarantineRecord]:
         keys = [f"quarantine/{shard:06d}.json" for shard in sorted(self.quarantined())]
         return list(read_records(self.storage, keys, QuarantineRecord))
 
-    def _numbers(self, folder: str, width: int = 6) -> set[int]:
-        """Numbers of a folder's records, by listing."""
+    def numbers(self, folder: str, width: int = 6) -> set[int]:
+        """Numbers of a folder's records, of `width` digits, by listing."""
         names = (file.key.removeprefix(f"{folder}/") for file in self.storage.list(folder))
         numbered = ((name, int(found[1])) for name in names if (found := _NUMBERED.fullmatch(name)))
         # Only names in the form that is written: no drafts, and not "7.json" for "000007.json".
@@ -303,8 +290,7 @@ def open_runs(path: Storage | Path | str) -> list[Run]:
     return runs
 
 
-@dataclass(frozen=True)
-class LabelCounts:
+class LabelCounts(NamedTuple):
     """Planned and committed labels of runs, and the number of missing shards."""
 
     n: int
@@ -332,8 +318,7 @@ def find_scene(runs: Sequence[Run], scene: int) -> tuple[Run, int]:
     """
     left = scene
     for run in runs:
-        scenes = ShardRanges.of(range(-(-run.n // run.layout.candidates_per_scene)))
-        scenes = scenes if run.scenes is None else scenes.within(run.scenes)
+        scenes = run.counted(run.n)
         if 0 <= left < len(scenes):
             return run, scenes[left]
         left -= len(scenes)

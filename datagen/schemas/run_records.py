@@ -207,11 +207,10 @@ class Commit(StoredRecord):
 
 def foreign_field(manifest: Manifest, shard: int, commit: Commit) -> tuple[str, str] | None:
     """(field, problem) where a commit cannot belong to this shard of the run; else None."""
-    layout, path = manifest.layout, f"{commit.attempt}.zip"
+    layout = manifest.layout
     expected = {"shard": shard, "spec_hash": manifest.spec_hash, "scenes": layout.scenes_per_shard}
-    return other_value(commit, **expected, samples=layout.samples_per_shard) or other_value(
-        commit.object, path=path
-    )
+    found = other_value(commit, **expected, samples=layout.samples_per_shard)
+    return found or other_value(commit.object, path=f"{commit.attempt}.zip")
 
 
 def other_value(record: StoredRecord, **expected: object) -> tuple[str, str] | None:
@@ -261,6 +260,34 @@ class QuarantineRecord(StoredRecord):
     causes: tuple[str, ...]
     stacks: tuple[str, ...]
     created: str
+
+
+class SealedPart(StoredRecord):
+    """One run in a sealed store: the samples wanted of it, and its missing shards."""
+
+    spec_hash: Digest
+    scenes_per_shard: int
+    n: int = Field(ge=1, le=10**12)
+    samples: int = Field(ge=0)
+    missing: Ranges
+
+
+class StoreRecord(StoredRecord):
+    """data.json: the sealed store that counts, what it was made from, and its files.
+
+    `rows_sha256` is over the digests of its shards, in order.
+    """
+
+    format_version: int = FORMAT_VERSION
+    name: str = Field(pattern=r"^data(-[1-9][0-9]{0,8})?\.zarr$")
+    rows_sha256: Digest
+    parts: tuple[SealedPart, ...] = Field(min_length=1)
+    files: tuple[FileEntry, ...]
+
+    def part_of(self, manifest: Manifest) -> SealedPart | None:
+        """What it holds of the run with this manifest."""
+        key = manifest.spec_hash, manifest.layout.scenes_per_shard
+        return next((part for part in self.parts if (part.spec_hash, part.scenes_per_shard) == key), None)
 
 
 STAGES = ("draw", "settle", "observe", "visibility", "grasps", "plan", "execute", "write")

@@ -25,8 +25,7 @@ from zarr.codecs import BytesCodec, Crc32cCodec, VLenUTF8Codec, ZstdCodec
 from zarr.storage import MemoryStore
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import TABLES, Field, RecordSchema, Table
-from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.fields import REDRAW_CAUSES, TABLES, Field, RecordSchema, Table
 from datagen.schemas.run_records import Layout
 from datagen.schemas.specification import Specification
 
@@ -69,16 +68,16 @@ def _row_bytes(schema: RecordSchema, field: Field) -> int:
     return int(np.prod(schema.shape(field, 1))) * np.dtype(field.dtype).itemsize
 
 
-def chunk_key(field: Field, index: int) -> str:
-    """Name of a field's chunk: its index along the rows, and 0 along the field's own axes."""
-    return f"c.{index}{'.0' * len(field.dims)}"
+def chunk_path(name: str, index: int, axes: int) -> str:
+    """Path of a chunk, or of a file of chunks, of an array with further `axes` than its rows."""
+    return f"{name}/c.{index}{'.0' * axes}"
 
 
 def chunk_paths(schema: RecordSchema, layout: Layout, table: Table, field: Field) -> tuple[str, ...]:
     """Paths of an array's chunks in a shard's folder, in order of rows."""
     rows = rows_per_shard(layout, table)
     count = rows // chunk_rows(schema, field, rows)
-    return tuple(f"{field.name}/{chunk_key(field, i)}" for i in range(count))
+    return tuple(chunk_path(field.name, i, len(field.dims)) for i in range(count))
 
 
 def fill_value(field: Field) -> Any:
@@ -144,8 +143,12 @@ def encode_chunk(field: Field, values: Array) -> bytes:
         raw = VLenUTF8().encode(_checked_text(field, values))
     else:
         raw = np.ascontiguousarray(values, np.dtype(field.dtype).newbyteorder("<"))
-    packed = bytes(Zstd(level=ZSTD_LEVEL).encode(raw))
-    return packed + google_crc32c.value(packed).to_bytes(4, "little")
+    return with_crc32c(bytes(Zstd(level=ZSTD_LEVEL).encode(raw)))
+
+
+def with_crc32c(data: bytes) -> bytes:
+    """The data and its checksum, as Zarr's codec writes it."""
+    return data + google_crc32c.value(data).to_bytes(4, "little")
 
 
 @lru_cache(maxsize=16)

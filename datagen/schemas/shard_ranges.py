@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from operator import eq
 from typing import Any, overload
 
 import numpy as np
@@ -35,23 +36,16 @@ class ShardRanges(Sequence[int]):
         if isinstance(shards, ShardRanges):
             return shards
         if isinstance(shards, range) and shards.step == 1:
-            bounds = [(shards.start, shards.stop)] if shards else []
-            return cls(np.array(bounds, np.int64).reshape(-1, 2))
+            return cls.between([(shards.start, shards.stop)] if shards else [])
         numbers = np.unique(shards if isinstance(shards, np.ndarray) else np.fromiter(shards, np.int64))
-        if not len(numbers):
-            return cls(np.empty((0, 2), np.int64))
-        breaks = np.flatnonzero(np.diff(numbers) > 1)
-        first = numbers[np.concatenate([[0], breaks + 1])]
-        last = numbers[np.concatenate([breaks, [len(numbers) - 1]])]
-        return cls(np.stack([first, last + 1], axis=1))
+        is_first = np.diff(numbers, prepend=-2) > 1
+        is_last = np.append(is_first, True)[1:]
+        return cls(np.stack([numbers[is_first], numbers[is_last] + 1], axis=1))
 
     def union(self, others: ShardRanges) -> ShardRanges:
-        merged: list[tuple[int, int]] = []
-        for first, past in sorted([*self.ranges, *others.ranges]):
-            if merged and first <= merged[-1][1]:
-                first, past = merged[-1][0], max(merged.pop()[1], past)
-            merged.append((first, past))
-        return ShardRanges.between(merged)
+        more = others.without(self)
+        bounds = np.concatenate([self.bounds, more.bounds])
+        return _ALL.without(_ALL.without(ShardRanges(bounds[np.argsort(bounds[:, 0])])))
 
     def times(self, size: int) -> ShardRanges:
         """The numbers in the blocks of `size` consecutive numbers that these count."""
@@ -94,9 +88,7 @@ class ShardRanges(Sequence[int]):
     def __getitem__(self, index: int | slice) -> int | list[int]:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
-        if not -len(self) <= index < len(self):
-            raise IndexError(index)
-        at = index % len(self)
+        at = range(len(self))[index]
         row = int(np.searchsorted(self._ends, at, side="right"))
         return int(self.bounds[row, 1] - (self._ends[row] - at))
 
@@ -114,11 +106,7 @@ class ShardRanges(Sequence[int]):
     def __eq__(self, other: object) -> bool:
         if isinstance(other, ShardRanges):
             return np.array_equal(self.bounds, other.bounds)
-        return (
-            isinstance(other, Sequence)
-            and len(self) == len(other)
-            and all(a == b for a, b in zip(self, other, strict=True))
-        )
+        return isinstance(other, Sequence) and len(self) == len(other) and all(map(eq, self, other))
 
     def __hash__(self) -> int:
         return hash(self.bounds.tobytes())
@@ -126,3 +114,6 @@ class ShardRanges(Sequence[int]):
     def __repr__(self) -> str:
         shown = ", ".join(f"{first}-{past - 1}" for first, past in self.bounds[:10])
         return f"ShardRanges({shown}{', ...' if len(self.bounds) > 10 else ''})"
+
+
+_ALL = ShardRanges.of(range(2**62))

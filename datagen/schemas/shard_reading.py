@@ -6,18 +6,151 @@ their crc32c always. Works on any storage, without opening fifty arrays per shar
 
 from __future__ import annotations
 
+import io
 import math
+import zipfile
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.run import Rows, Run
 from datagen.schemas.run_records import Commit
-from datagen.schemas.shard_sources import ShardObject, Source
-from datagen.schemas.stored_arrays import DAMAGE_FIX, Array, StoredArray, decode_chunk
+from datagen.schemas.safe_files import DAMAGED_ZIP
+from datagen.schemas.storage import Storage
+from datagen.schemas.stored_arrays import (
+    DAMAGE_FIX,
+    MAX_DECODED_BYTES,
+    MAX_META_BYTES,
+    Array,
+    StoredArray,
+    decode_chunk,
+    has_crc32c,
+    parse_metadata,
+)
+
+Wanted = Sequence[tuple[StoredArray, int]]  # chunks, each as its array and its index there
+
+
+class Source(Protocol):
+    """Where arrays lie: `chunks` are (address, bytes), in the order of the wanted ones.
+
+    InputError for a missing, foreign or damaged file.
+    """
+
+    @property
+    def url(self) -> str: ...
+    def metadata(self, names: Sequence[str]) -> dict[str, StoredArray]: ...
+    def chunks(self, wanted: Wanted) -> Iterator[tuple[str, bytes]]: ...
+
+
+@dataclass(eq=False)
+class ShardObject:
+    """The committed object of one shard. Its sha256 is checked when it is first read."""
+
+    run: Run
+    commit: Commit
+    is_checked: bool = False
+
+    @property
+    def url(self) -> str:
+        return f"{self.run.storage.url}/shards/{self.commit.object.path}"
+
+    def metadata(self, names: Sequence[str]) -> dict[str, StoredArray]:
+        files, paths = self._open(), {name: f"{name}/zarr.json" for name in names}
+        return {
+            name: parse_metadata(f"{self.url}/{path}", name, files.get(path)) for name, path in paths.items()
+        }
+
+    def chunks(self, wanted: Wanted) -> Iterator[tuple[str, bytes]]:
+        files = self._open()
+        for path in (array.path(index) for array, index in wanted):
+            yield f"{self.url}/{path}", files.get(path)
+
+    def _open(self) -> ZipFiles:
+        data = self.run.read_object(self.commit, check=not self.is_checked)
+        self.is_checked = True
+        return ZipFiles(self.url, data)
+
+
+# OverflowError: an offset that no file has.
+_DAMAGED = (*DAMAGED_ZIP, OverflowError)
+
+
+class ZipFiles:
+    """The files in a shard's object. InputError where it is not such a zip, or lacks a file."""
+
+    def __init__(self, place: str, data: bytes) -> None:
+        self._place = place
+        try:
+            self._zip = zipfile.ZipFile(io.BytesIO(data))
+        except _DAMAGED as e:
+            raise InputError(place, "", f"is not the object of a shard ({e})", DAMAGE_FIX) from e
+        self.paths = [entry.filename for entry in self._zip.infolist()]
+
+    def get(self, path: str) -> bytes:
+        try:
+            entry = self._zip.getinfo(path)
+            if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
+                raise zipfile.BadZipFile("compressed or encrypted")
+            return self._zip.read(entry)
+        except KeyError as e:
+            raise InputError(f"{self._place}/{path}", "", "no such file", DAMAGE_FIX) from e
+        except _DAMAGED as e:
+            raise InputError(f"{self._place}/{path}", "", f"is damaged ({e})", DAMAGE_FIX) from e
+
+
+@dataclass(eq=False)
+class StoreFiles:
+    """A sealed store, in whose files the chunks of many shards lie behind an index."""
+
+    storage: Storage
+    _indices: dict[str, npt.NDArray[np.uint64]] = field(default_factory=dict)
+
+    @property
+    def url(self) -> str:
+        return self.storage.url
+
+    def metadata(self, names: Sequence[str]) -> dict[str, StoredArray]:
+        found: dict[str, StoredArray] = {}
+        keys = [f"{name}/zarr.json" for name in names]
+        for name, (key, data) in zip(names, self.storage.get_many(keys, MAX_META_BYTES), strict=True):
+            if data is None:
+                raise InputError(f"{self.url}/{key}", name, "no such file", DAMAGE_FIX)
+            found[name] = parse_metadata(f"{self.url}/{key}", name, data)
+        return found
+
+    def chunks(self, wanted: Wanted) -> Iterator[tuple[str, bytes]]:
+        return self.storage.concurrent_map(lambda one: self._chunk(*one), wanted)
+
+    def _chunk(self, array: StoredArray, index: int) -> tuple[str, bytes]:
+        file, inner = divmod(index, array.per_file) if array.per_file else (index, 0)
+        key = array.path(file)
+        place = f"{self.url}/{key}"
+        if not array.per_file:
+            data = self.storage.get(key, MAX_DECODED_BYTES)
+        else:
+            start, size = (int(number) for number in self._index(key, array)[inner])
+            if start + size > 2**50 or not 0 < size <= MAX_DECODED_BYTES:
+                raise InputError(place, array.name, "its index names a chunk that cannot be", DAMAGE_FIX)
+            data = self.storage.get_range(key, start, size)
+        if data is None:
+            raise InputError(place, array.name, "no such file", DAMAGE_FIX)
+        return place, data
+
+    def _index(self, key: str, array: StoredArray) -> npt.NDArray[np.uint64]:
+        if key not in self._indices:
+            size = 16 * array.per_file + 4
+            data = self.storage.get_range(key, -size, size)
+            if data is None or len(data) != size or not has_crc32c(data):
+                problem = "its index is missing or damaged"
+                raise InputError(f"{self.url}/{key}", array.name, problem, DAMAGE_FIX)
+            self._indices[key] = np.frombuffer(data[:-4], "<u8").reshape(-1, 2)
+        return self._indices[key]
 
 
 @dataclass(frozen=True)
@@ -46,10 +179,6 @@ class ShardPlace:
     @property
     def url(self) -> str:
         return self.source.url
-
-    def metadata(self, names: Sequence[str]) -> dict[str, StoredArray]:
-        """Read the metadata of the named arrays. InputError for a missing, foreign or damaged file."""
-        return self.source.metadata(names)
 
     def read(self, arrays: Iterable[StoredArray]) -> dict[str, Array]:
         """Read the wanted rows of each array. InputError for a missing, foreign or damaged file."""
@@ -89,7 +218,7 @@ class ShardPlace:
 
 def committed_place(run: Run, commit: Commit, rows: Rows | None = None) -> ShardPlace:
     """The wanted rows [all] of a committed shard."""
-    source = ShardObject(run, commit.object)
+    source = ShardObject(run, commit)
     wall_s = commit.cost.all_s["wall"] / max(commit.samples, 1)
     rows = Rows(0, commit.scenes, commit.samples) if rows is None else rows
     return ShardPlace(source, 0, rows, commit.scenes, commit.samples, wall_s)
@@ -100,24 +229,11 @@ def read_committed(
 ) -> dict[str, Array]:
     """Read rows [all] of the named arrays of a committed shard. InputError as `ShardPlace.read`."""
     place = committed_place(run, commit, rows)
-    return place.read(place.metadata(names).values())
+    return place.read(place.source.metadata(names).values())
 
 
 def read_scene(run: Run, scene: int) -> SceneRows:
-    """Read scene `scene` of a run. InputError where it is not planned or its shard is not committed."""
-    scenes = -(-run.n // run.layout.candidates_per_scene)
-    if not 0 <= scene < scenes:
-        raise InputError(
-            run.storage.url, "--scene", f"{scene} is not in this run", f"Give one from 0 to {scenes - 1}"
-        )
-    shard = scene // run.layout.scenes_per_shard
-    if shard not in run.committed():
-        raise InputError(
-            run.storage.url,
-            "--scene",
-            f"{scene} is in shard {shard}, which is not committed",
-            "Resume the run, or choose another scene",
-        )
+    """Read one scene. InputError as `read_scenes`."""
     return next(read_scenes(run, [scene]))
 
 
@@ -138,13 +254,6 @@ def read_scenes(run: Run, scenes: Iterable[int]) -> Iterator[SceneRows]:
             record={f.name: arrays[f.name][row] for f in run.schema.scene_fields},
             samples={f.name: arrays[f.name][rows] for f in run.schema.sample_fields},
         )
-
-
-def committed_scenes(run: Run) -> int:
-    """Number of scenes before the first missing shard, including those beyond n in the last shard."""
-    committed = run.committed()
-    shards = next(k for k in range(len(committed) + 1) if k not in committed)
-    return shards * run.layout.scenes_per_shard
 
 
 def read_shard(run: Run, shard: int) -> dict[str, Array]:

@@ -21,7 +21,7 @@ from numcodecs.zstd import Zstd
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import RecordSchema
 from datagen.schemas.run_records import Layout
-from datagen.schemas.shard_files import MAX_TEXT_BYTES, group_metadata
+from datagen.schemas.shard_files import MAX_TEXT_BYTES, chunk_path, group_metadata
 
 Array = npt.NDArray[Any]
 
@@ -52,6 +52,10 @@ class StoredArray:
     @property
     def is_text(self) -> bool:
         return self.dtype == "string"
+
+    def path(self, index: int) -> str:
+        """Path of a chunk, or of a file of chunks."""
+        return chunk_path(self.name, index, len(self.shape) - 1)
 
 
 def parse_metadata(place: str, name: str, data: bytes) -> StoredArray:
@@ -106,7 +110,7 @@ def arrays_of(schema: RecordSchema, layout: Layout) -> Mapping[str, StoredArray]
 def decode_chunk(place: str, array: StoredArray, data: bytes) -> Array:
     """Decode a chunk's values, (chunk_rows, ...). InputError naming `place` for damaged bytes."""
     packed = data[:-4]
-    if len(data) < 5 or google_crc32c.value(packed) != int.from_bytes(data[-4:], "little"):
+    if len(data) < 5 or not has_crc32c(data):
         raise InputError(place, array.name, "the crc32c does not match: the file is damaged", DAMAGE_FIX)
     shape = (array.chunk_rows, *array.shape[1:])
     count = math.prod(shape)
@@ -129,9 +133,9 @@ def decode_chunk(place: str, array: StoredArray, data: bytes) -> Array:
         ) from e
 
 
-def chunk_path(array: StoredArray, index: int) -> str:
-    """Path of a chunk, or of a file of chunks."""
-    return f"{array.name}/c.{index}{'.0' * len(array.shape[1:])}"
+def has_crc32c(data: bytes) -> bool:
+    """Whether data ends with the checksum of the rest, as Zarr's codec writes it."""
+    return google_crc32c.value(data[:-4]) == int.from_bytes(data[-4:], "little")
 
 
 def _content_bytes(frame: bytes) -> int:

@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas
 
-from datagen.schemas.fields import Field, Table
-from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.fields import OUTCOMES, Field, Table
 from datagen.schemas.shard_reading import ShardPlace
 from datagen.tables.stored_fields import fields_of, refuse_unknown
 from datagen.train.reader import JOIN_FIELDS, Columns, load_shard, native

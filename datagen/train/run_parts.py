@@ -13,8 +13,7 @@ from datagen.schemas.fields import SCHEMA_VERSION, SCHEMAS
 from datagen.schemas.record_files import MERGED
 from datagen.schemas.run import Rows, Run, open_runs
 from datagen.schemas.run_records import Layout
-from datagen.schemas.shard_reading import ShardPlace, committed_place
-from datagen.schemas.shard_sources import StoreFiles
+from datagen.schemas.shard_reading import ShardPlace, StoreFiles, committed_place
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
 from datagen.schemas.stored_arrays import MAX_META_BYTES, StoredArray, arrays_of

@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import SceneRows, sized_schema
+from datagen.schemas.fields import REDRAW_CAUSES, SceneRows, sized_schema
 from datagen.schemas.identity import sample_ids
-from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import SceneCandidates

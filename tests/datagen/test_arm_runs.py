@@ -10,7 +10,7 @@ import pytest
 
 from datagen import cli
 from datagen.configuration.stored_scenes import open_stored_scenes, specify_again
-from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.run import Run
 from tests.datagen.conftest import PAIRED
 from tests.sim_extra import needs_sim

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +14,7 @@ from datagen.schemas.record_files import signed_json
 from datagen.schemas.run import Run
 from tests.made_runs import flip, object_of
 from tests.refusals import refused
+from tests.small_disk import small_disk
 from tests.small_runs import CONFIG, PER_SCENE, files_of, submit_arguments
 
 
@@ -117,14 +115,9 @@ def test_a_shard_file_that_was_changed(copied: Path, capsys: pytest.CaptureFixtu
 
 @pytest.fixture
 def tiny_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 96 kB, less than a small run needs."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", str(disk)]
-    if os.geteuid() != 0 or shutil.which("mount") is None or subprocess.run(command, check=False).returncode:
-        pytest.skip("mounting a small file system needs the rights of root")
-    yield disk
-    subprocess.run(["umount", "-l", str(disk)], check=True)
+    """Less than a small run needs."""
+    with small_disk(tmp_path / "disk", "96k") as disk:
+        yield disk
 
 
 def test_a_full_disk(tiny_disk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

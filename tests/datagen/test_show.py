@@ -14,7 +14,7 @@ from PIL import Image, ImageColor, ImageSequence
 from datagen import cli
 from datagen.display.styles import OUTCOME_STYLES
 from datagen.drawing.scene_picture import Shown, best_success, draw_scene_picture
-from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_scene
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene

@@ -23,7 +23,7 @@ from datagen.display.styles import (
     SCORE_COLOURS,
     TARGET,
 )
-from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.fields import OUTCOMES
 
 # What dichromats see, on linear RGB, at full severity (Machado, Oliveira, Fernandes 2009).
 EYES = {

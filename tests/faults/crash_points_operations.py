@@ -12,8 +12,7 @@ from uuid import uuid4
 from datagen.cluster.run_recorder import close_lost_attempts
 from datagen.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.checking.check_runs import Checked, check_runs
-from datagen.schemas.checking.cleaning import clean_runs
-from datagen.schemas.checking.repair import repair_runs
+from datagen.schemas.checking.repair import clean_runs, repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS, RecordSchema
 from datagen.schemas.merging import merge_runs, plan_merge
@@ -102,7 +101,7 @@ def damage(folder: Path, places: Iterable[str] = ("",)) -> list[str]:
         for place in places
         if (folder / place).exists()
         for finding in check_runs(open_storage(folder / place, probe=False), Checked())
-        if finding.is_damage
+        if finding.kind != "stale"
     ]
 
 

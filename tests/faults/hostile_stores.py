@@ -19,7 +19,7 @@ from numcodecs.zstd import Zstd
 from datagen.schemas.record_files import commit_key, signed_json
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import store_record
-from datagen.schemas.shard_sources import ZipFiles
+from datagen.schemas.shard_reading import ZipFiles
 from tests.made_runs import resign
 
 OBJECT = "shards/a-1.zip"

@@ -159,7 +159,7 @@ def check_cut(folder: Path, noted: Path, counts: Counter[str]) -> None:
     for finding in check_runs(run.storage, Checked()):
         # What a resume writes: a copy or a start of which the other was first, and the ends of lost attempts.
         is_missing = finding.kind in ("record", "account") and finding.problem.startswith("missing")
-        assert is_missing or not finding.is_damage, finding
+        assert is_missing or finding.kind == "stale", finding
         counts["records missing"] += is_missing
     counts["torn job states"] += sum(one.state is None for one in Jobs(run.storage).all())
 

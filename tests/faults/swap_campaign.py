@@ -13,8 +13,7 @@ import numpy as np
 
 from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.run_records import LedgerEntry, QuarantineRecord
-from datagen.schemas.sealing import SEALED, seal
-from datagen.schemas.sealing.contents import RECORD
+from datagen.schemas.sealing import RECORD, SEALED, seal
 from datagen.schemas.storage import open_storage
 from tests.faults.crash_points_operations import remake
 from tests.faults.damage_campaign import content, findings_at, repair_at
@@ -124,7 +123,7 @@ def try_swap(clean: Path, world: Path, swap: Swap, found: Swaps) -> None:
         found.wrong.append(f"{swap.kind}: {swap.one} with {swap.other}: {what}")
 
     for place in swap.places:
-        if not any(finding.is_damage for finding in findings_at(world / place)):
+        if not any(finding.kind != "stale" for finding in findings_at(world / place)):
             wrong(f"{place}: missed")
     # All are swapped before one is repaired: a file in another place counts as lost where it belongs.
     repaired = {place: repair_at(world / place) for place in swap.places}
@@ -132,7 +131,7 @@ def try_swap(clean: Path, world: Path, swap: Swap, found: Swaps) -> None:
         finding
         for each in repaired.values()
         for finding in each.left
-        if finding.is_damage and finding.kind != "lost"  # until it is resumed
+        if finding.kind != "stale" and finding.kind != "lost"  # until it is resumed
     ]
     # The ends of attempts whose shards are set aside become superseded.
     there = set(files_of(world).values())

@@ -17,6 +17,7 @@ from tests.faults.damage_campaign import (
     flips,
     keys_of,
     kind_of,
+    make_merged,
     make_place,
     try_all,
 )
@@ -29,11 +30,14 @@ def quick() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sealed run of two shards and a failed attempt. Tests only copy it."""
+@pytest.fixture(scope="module", params=["run", "merged"])
+def clean(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sealed run of two shards and a failed attempt, or merged runs. Tests only copy it."""
     folder = tmp_path_factory.mktemp("damage") / "clean"
-    make_place(folder, n=9, scenes_per_shard=1)
+    if request.param == "merged":
+        make_merged(folder)
+    else:
+        make_place(folder, n=9, scenes_per_shard=1)
     assert findings_at(folder) == []
     return folder
 

@@ -13,7 +13,7 @@ import pytest
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
-from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.fields import REDRAW_CAUSES
 from datagen.schemas.run import Run
 from datagen.schemas.specification import Specification
 from datagen.workers.geometry.mesh import Mesh

@@ -23,8 +23,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from datagen.cluster.run_recorder import close_lost_attempts
 from datagen.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.checking.check_runs import Checked, check_runs
-from datagen.schemas.checking.cleaning import clean_runs
-from datagen.schemas.checking.repair import repair_runs
+from datagen.schemas.checking.repair import clean_runs, repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.merging import merge_runs, plan_merge
@@ -58,7 +57,7 @@ EXAMPLES, STEPS = 15, 40
 def findings(place: Place) -> list[Any]:
     """What `verify` calls damage."""
     storage = open_storage(place.folder, probe=False)
-    return [finding for finding in check_runs(storage, Checked()) if finding.is_damage]
+    return [finding for finding in check_runs(storage, Checked()) if finding.kind != "stale"]
 
 
 def close_all(place: Place) -> None:

@@ -17,7 +17,7 @@ from datagen.schemas.fields import Field, RecordSchema
 from datagen.schemas.run_records import Layout
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_files import encode_shard
-from datagen.schemas.shard_sources import ZipFiles
+from datagen.schemas.shard_reading import ZipFiles
 from datagen.schemas.stored_arrays import StoredArray, decode_chunk, parse_metadata
 from datagen.train.reader import SampleReader
 from tests.made_runs import make_run

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -15,19 +14,17 @@ import zarr
 from obstore.store import from_url
 from zarr.storage import ObjectStore
 
-from datagen.cluster.run_recorder import close_lost_attempts
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
-from datagen.schemas.fields import SCHEMAS, RecordSchema
+from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.merging import MergeResult, merge_runs, plan_merge
-from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.record_files import signed_json
-from datagen.schemas.run import Run, open_runs
-from datagen.schemas.run_records import Commit, Cost, LedgerEntry
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit, Cost, FileEntry, LedgerEntry
 from datagen.schemas.sealing import seal, store_record
 from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.storage import Storage, open_storage
-from tests.made_runs import Tables, attempt, commit_of, make_run, rows_of, small_spec
+from tests.made_runs import Tables, attempt, make_run, rows_of, small_spec, write
 
 Arrays = dict[str, np.ndarray[Any, Any]]
 
@@ -39,20 +36,9 @@ FEW = (
 FULL = SCHEMAS["heuristic"]
 
 
-def few_fields() -> RecordSchema:
-    """The heuristic schema with few fields."""
-    scenes, samples = (
-        tuple(f for f in fields if f.name in FEW) for fields in (FULL.scene_fields, FULL.sample_fields)
-    )
-    return replace(FULL, scene_fields=scenes, sample_fields=samples)
-
-
 def folder_of(run: Run) -> Path:
     assert run.storage.folder is not None
     return run.storage.folder
-
-
-# Runs ----------------------------------------------------------------------------------------
 
 
 def sealed_run(folder: Path | str, n: int = 19) -> Run:
@@ -73,28 +59,16 @@ def fill(
     return run
 
 
-def resume(storage: Storage) -> None:
-    """Make the missing shards, as `datagen resume` does, and seal."""
-    for run in open_runs(storage):
-        for shard in run.missing():
-            assert attempt(run, shard, f"again-{shard}-{len(run.ledger.attempts())}")
-        close_lost_attempts(run)
-    seal(storage)
-
-
 def merge(folder: Path | str, names: Iterable[str], out: str = "out") -> MergeResult:
     return merge_runs(plan_merge([f"{folder}/{name}" for name in names], f"{folder}/{out}"))
 
 
-def commit_object(run: Run, shard: int, data: bytes, name: str = "f", **changes: Any) -> Commit:
+def commit_object(run: Run, shard: int, data: bytes, name: str = "f") -> Commit:
     """Commit any bytes as a shard's object, with the sums of the rows that the shard should have."""
-    scenes, samples = rows_of(run, shard)
-    sums = dict(zip(REDRAW_CAUSES, scenes["redraws"].sum(axis=0).tolist(), strict=True))
-    redraws = {cause: count for cause, count in sums.items() if count}
+    commit = write(run, shard, name)
+    run.storage.put(f"shards/{name}.zip", data)
     run.ledger.start(name, shard)
-    entry = run.write_object(name, data)
-    commit = commit_of(run, shard, name, entry, int(samples["label"].sum()), redraws)
-    commit = commit.model_copy(update=changes)
+    commit = commit.model_copy(update={"object": FileEntry.of(f"{name}.zip", data)})
     assert run.commit(commit)
     return commit
 
@@ -108,9 +82,6 @@ def edit(path: Path, **changes: Any) -> None:
     record = json.loads(path.read_text())
     del record["sha256"]
     path.write_bytes(signed_json(record | changes))
-
-
-# Rows ----------------------------------------------------------------------------------------
 
 
 def of(run: Run, *shards: int) -> list[tuple[Run, int]]:
@@ -151,9 +122,6 @@ def tree(storage: Storage) -> dict[str, bytes | None]:
     return {file.key: storage.get(file.key, 2**30) for file in storage.list("")}
 
 
-# Checks --------------------------------------------------------------------------------------
-
-
 def check(place: Path | str) -> tuple[list[Finding], Checked]:
     checked = Checked()
     return list(check_runs(open_storage(place, probe=False, create=False), checked)), checked
@@ -162,9 +130,6 @@ def check(place: Path | str) -> tuple[list[Finding], Checked]:
 def found(place: Path | str) -> list[tuple[str, str]]:
     """(kind, file) of every finding."""
     return [(f.kind, f.key) for f in check(place)[0]]
-
-
-# Changes -------------------------------------------------------------------------------------
 
 
 class Killed(BaseException):

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -63,18 +62,11 @@ class Disk:
                 found.add(str(path.relative_to(place)))
         return found
 
-    @contextmanager
-    def watched(self, place: Path, name: str) -> Generator[list[set[str]]]:
-        """Gives what would be lost at each moment at which something gets this name."""
+    def watched(self, place: Path, name: str) -> list[set[str]]:
+        """What would be lost at each moment at which something gets this name."""
         found: list[set[str]] = []
-
-        def look(given: str) -> None:
-            if given == name:
-                found.append(self.lost(place))
-
-        self.named = look
-        yield found
-        self.named = lambda name: None
+        self.named = lambda given: found.append(self.lost(place)) if given == name else None
+        return found
 
 
 @pytest.fixture
@@ -85,8 +77,8 @@ def disk(few_arrays: None, monkeypatch: pytest.MonkeyPatch) -> Disk:
 def test_a_new_name_is_given_to_bytes_that_last_and_lasts_itself(disk: Disk, tmp_path: Path) -> None:
     place = open_storage(tmp_path / "far" / "away")
     assert disk.lost(tmp_path) == set()
-    with disk.watched(tmp_path, "new") as lost:
-        place.put_new("a/b/new", b"bytes")
+    lost = disk.watched(tmp_path, "new")
+    place.put_new("a/b/new", b"bytes")
     assert lost == [{"far/away/a", "far/away/a/b"}] and disk.lost(tmp_path) == set()
 
 
@@ -102,8 +94,8 @@ def test_what_somebody_else_wrote_and_did_not_make_last_is_made_to(disk: Disk, t
 def test_a_shard_is_committed_when_its_object_lasts(disk: Disk, tmp_path: Path) -> None:
     run = make_run(tmp_path, 20, shards=[])
     made = write(run, 0, "a-0")
-    with disk.watched(tmp_path, "000000.json") as lost:
-        assert run.commit(made)
+    lost = disk.watched(tmp_path, "000000.json")
+    assert run.commit(made)
     assert lost == [{"commits"}]
     assert attempt(run, 1, "a-1") and disk.lost(tmp_path) == set()
 
@@ -111,8 +103,8 @@ def test_a_shard_is_committed_when_its_object_lasts(disk: Disk, tmp_path: Path) 
 def test_a_store_counts_and_the_one_before_it_goes_when_it_lasts(disk: Disk, tmp_path: Path) -> None:
     for n in (20, 40):
         run = make_run(tmp_path, n)
-        with disk.watched(tmp_path, "data.json") as lost:
-            seal(run.storage)
+        lost = disk.watched(tmp_path, "data.json")
+        seal(run.storage)
         assert lost == [set()] and disk.lost(tmp_path) == set()
     assert (tmp_path / "data-2.zarr").exists() and not (tmp_path / "data.zarr").exists()
 
@@ -121,7 +113,7 @@ def test_merged_shards_are_committed_when_they_last(disk: Disk, tmp_path: Path) 
     make_run(tmp_path / "a", 20)
     make_run(tmp_path / "b", 10, 1)
     planned = plan_merge([f"{tmp_path}/a", f"{tmp_path}/b"], f"{tmp_path}/out")
-    with disk.watched(tmp_path / "out", "000000.json") as lost:
-        merge_runs(planned)
+    lost = disk.watched(tmp_path / "out", "000000.json")
+    merge_runs(planned)
     assert [{Path(path).name for path in each} for each in lost] == [{"commits"}] * 2
     assert disk.lost(tmp_path / "out") == set()

@@ -12,26 +12,22 @@ import pytest
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobRecord, Jobs, JobState, new_job_id
 from datagen.schemas.quarantine import lift_quarantine, lifted_records
-from datagen.schemas.run_records import QuarantineRecord
 from datagen.schemas.storage import open_storage
-from tests.made_runs import make_run
+from tests.made_runs import give_up, make_run
 
 NOBODY = 2**22 + 1  # beyond the largest number that a process can have
 
 
 def record_of(started: datetime, pid: int, host: str = "") -> JobRecord:
-    return JobRecord(
-        id=new_job_id(),
-        command=("datagen", "submit"),
-        host=host or platform.node(),
-        pid=pid,
-        started=started.isoformat(),
-        address="local",
-    )
+    where = {"host": host or platform.node(), "pid": pid, "address": "local"}
+    return JobRecord(id=new_job_id(), command=("datagen", "submit"), started=started.isoformat(), **where)  # type: ignore[arg-type]
 
 
 def test_a_job_is_dead_when_it_is_silent_and_its_process_is_gone(tmp_path: Path) -> None:
     jobs, at = Jobs(open_storage(tmp_path)), datetime.now(UTC)
+    # This process began before now, and long after a job with its number.
+    jobs.begin(record_of(at - timedelta(days=3000), os.getpid()))
+    assert jobs.all()[0].health(at) == "dead"
     for pid, host, minutes, health in (
         (os.getpid(), "", 0, "live"),
         (os.getpid(), "", 10, "live"),  # it is there, however long it says nothing
@@ -51,13 +47,6 @@ def test_a_job_is_dead_when_it_is_silent_and_its_process_is_gone(tmp_path: Path)
             jobs.put_state(JobState(id=record.id, updated=heard, phase="making", end=end))  # type: ignore[arg-type]
             job = jobs.get(record.id)
             assert job is not None and job.health(at) == expected, (pid, minutes)
-
-
-def test_a_reused_process_number_is_not_the_job(tmp_path: Path) -> None:
-    # This process began before now, and long after the job did.
-    jobs, at = Jobs(open_storage(tmp_path)), datetime.now(UTC)
-    jobs.begin(record_of(at - timedelta(days=3000), os.getpid()))
-    assert jobs.all()[0].health(at) == "dead"
 
 
 def test_a_request_to_stop_at_once_is_not_replaced_by_a_weaker_one(tmp_path: Path) -> None:
@@ -86,30 +75,17 @@ def test_a_torn_state_is_as_if_it_were_absent_and_a_damaged_record_is_named(tmp_
 
 def test_lifting_keeps_every_record_and_a_cut_lift_is_completed(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", n=50, shards=[0, 2, 4])
-
-    def give_up(shard: int, cause: str) -> None:
-        run.quarantine(
-            QuarantineRecord(
-                shard=shard, seed=0, first_scene=0, scenes=2, attempts=("a",), causes=(cause,), stacks=("",),
-                created=cause,
-            )
-        )  # fmt: skip
-
-    give_up(1, "first")
-    give_up(3, "other")
+    give_up(run, 1, "first")
+    give_up(run, 3, "other")
     assert list(run.missing()) == []
     assert lift_quarantine(run) == [1, 3]
     assert list(run.missing()) == [1, 3] and run.quarantined() == set()
-    give_up(1, "second")
+    give_up(run, 1, "second")
     # As if a lift had been killed between its two steps.
     here = tmp_path / "run/quarantine"
     (here / "000001.lifted-2.json").write_bytes((here / "000001.json").read_bytes())
     assert lift_quarantine(run) == [1] and lift_quarantine(run) == []
-    assert [(r.shard, r.causes[0]) for r in lifted_records(run)] == [
-        (1, "first"),
-        (1, "second"),
-        (3, "other"),
-    ]
-    assert sorted(p.name for p in here.iterdir()) == [
-        "000001.lifted-1.json", "000001.lifted-2.json", "000003.lifted-1.json",
-    ]  # fmt: skip
+    told = [(record.shard, record.causes[0]) for record in lifted_records(run)]
+    assert told == [(1, "first"), (1, "second"), (3, "other")]
+    names = {"000001.lifted-1.json", "000001.lifted-2.json", "000003.lifted-1.json"}
+    assert {path.name for path in here.iterdir()} == names

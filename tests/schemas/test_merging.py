@@ -13,15 +13,16 @@ from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.merging import SPARE_CAUSE, merge_runs, plan_merge
-from datagen.schemas.merging.conflicts import refuse_different_rows
+from datagen.schemas.merging.plan import refuse_different_rows
 from datagen.schemas.record_files import MERGED, signed_json
 from datagen.schemas.run import Run, find_scene, label_counts, open_runs
-from datagen.schemas.run_records import FORMAT_VERSION, Layout, LedgerEntry, QuarantineRecord
-from datagen.schemas.sealing import seal, store_record
+from datagen.schemas.run_records import FORMAT_VERSION, Layout, LedgerEntry
+from datagen.schemas.sealing import store_record
 from datagen.schemas.specification import Source
 from datagen.schemas.storage import Storage, open_storage
 from datagen.train.run_parts import open_parts
-from tests.made_runs import Tables, attempt, files_of, make_run, manifest_of, rows_of, small_spec, tables_of
+from tests.faults.crash_points_operations import remake
+from tests.made_runs import Tables, files_of, make_run, rows_of, small_spec, tables_of
 from tests.schemas.checked import (
     Arrays,
     Changes,
@@ -30,10 +31,8 @@ from tests.schemas.checked import (
     dies_at,
     encoded,
     fill,
-    folder_of,
     found,
     merge,
-    resume,
     stored,
     tree,
 )  # fmt: skip
@@ -44,29 +43,20 @@ pytestmark = pytest.mark.usefixtures("few_arrays")
 # One specification ----------------------------------------------------------------------------
 
 
-def test_partial_runs_become_an_ordinary_run_and_the_cost_of_duplicates_is_kept(tmp_path: Path) -> None:
+def test_the_cost_of_duplicates_is_kept_and_missing_shards_are_named(tmp_path: Path) -> None:
     fill(tmp_path, "a", [0, 2], n=40)
     fill(tmp_path, "b", [1, 2, 5], n=60)
-    seal(Run.open(tmp_path / "a").storage)
-    sources = [files_of(tmp_path / who) for who in "ab"]
-    (written,) = merge(tmp_path, "ab").written
-    assert [files_of(tmp_path / who) for who in "ab"] == sources
-    assert (written.copied, written.there, written.spare) == (4, 0, 1)
+    merge(tmp_path, "ab")
     run = Run.open(tmp_path / "out")
-    assert (run.committed(), run.n, list(run.missing())) == ({0, 1, 2, 5}, 60, [3, 4])
-    kept = run.commit_of(2)
+    kept, (end,) = run.commit_of(2), run.ledger.ends()
     assert kept.attempt == "000002-a-2"  # the smaller name
-    (end,) = run.ledger.ends()
     assert (end.attempt, end.outcome, end.cause) == ("000002-b-2", "superseded", SPARE_CAUSE)
     assert end.cost == kept.cost and end.started == run.ledger.start_of(end.attempt).started  # type: ignore[union-attr]
-    assert run.ledger.attempts() == {
-        f"{name}-2" for name in ("000000-a", "000001-b", "000002-a", "000002-b", "000005-b")
-    }
     record = store_record(run.storage)
     assert record is not None and record.parts[0].missing == ((3, 5),)
-    assert found(tmp_path / "out") == [] and not (tmp_path / "out" / MERGED).exists()
-    before = tree(run.storage)
-    assert merge(tmp_path, "ab").written[0].copied == 0 and tree(run.storage) == before
+
+
+_OF = "sample_scene_index"
 
 
 def of_scenes(run: Run, scenes: Iterable[int]) -> Arrays:
@@ -77,29 +67,23 @@ def of_scenes(run: Run, scenes: Iterable[int]) -> Arrays:
     return {name: np.concatenate([tables[t][name] for tables in each]) for t in (0, 1) for name in each[0][t]}
 
 
-def by_scene(arrays: Arrays) -> Arrays:
-    orders = (
-        np.argsort(arrays["scene_index"], kind="stable"),
-        np.argsort(arrays["sample_scene_index"], kind="stable"),
-    )
-    samples = len(arrays["sample_scene_index"])
-    is_sample = {name: name.startswith(("sample", "candidate", "label", "distance")) for name in arrays}
-    assert all(
-        len(values) == (samples if is_sample[name] else len(orders[0])) for name, values in arrays.items()
-    )
-    return {name: values[orders[is_sample[name]]] for name, values in arrays.items()}
+def by_scene(run: Run, arrays: Arrays) -> Arrays:
+    """The rows in order of their scenes."""
+    orders = {t: np.argsort(arrays[k], kind="stable") for t, k in (("scene", "scene_index"), ("sample", _OF))}
+    return {f.name: arrays[f.name][orders[table]] for table, f in run.schema.fields}
 
 
 def assert_scenes(storage: Storage, scenes: Iterable[int]) -> None:
     """The store, and the runs as training reads them, have these scenes, each once, with their rows."""
     runs = open_runs(storage)
     wanted = of_scenes(runs[0], sorted(scenes))
-    assert_rows(by_scene(stored(storage)), wanted)
+    assert_rows(by_scene(runs[0], stored(storage)), wanted)
     counts = label_counts(runs)
     assert (counts.labels, counts.n) == (len(wanted["label"]), runs[0].n)
     parts = open_parts([storage.url], list(wanted), allow_incomplete=True)
     read = [place.read(part.arrays.values()) for part in parts for place in part.shards]
-    assert_rows(by_scene({name: np.concatenate([each[name] for each in read]) for name in wanted}), wanted)
+    found_ = {name: np.concatenate([each[name] for each in read]) for name in wanted}
+    assert_rows(by_scene(runs[0], found_), wanted)
     assert found(storage.url) == []
 
 
@@ -133,11 +117,11 @@ def test_each_scene_counts_once_whatever_the_sizes_of_shards_and_the_order_of_so
         assert_scenes(storage, held & set(range(end)))
     merge(folder, names[::-1], "other")
     assert whole(folder / "other") == whole(folder / "out")
-    resume(storage)  # parts lack shards
+    remake(folder / "out")  # parts lack shards
     assert_scenes(storage, range(end))
     for run in open_runs(storage):
         run.grow(5 * (end + more))
-    resume(storage)
+    remake(folder / "out")
     assert_scenes(storage, range(end + more))
 
 
@@ -150,25 +134,19 @@ def test_a_merge_into_existing_runs_adds_and_keeps_what_is_committed(tmp_path: P
     fill(tmp_path, "b", [0, 1], n=20)
     fill(tmp_path, "a", [1, 2], n=30)
     merge(tmp_path, "b")
-    before = files_of(tmp_path / "out" / "commits")
     (written,) = merge(tmp_path, "a").written
     run = Run.open(tmp_path / "out")
-    assert files_of(tmp_path / "out" / "commits").items() >= before.items()
     assert (written.there, written.copied, written.spare, run.n) == (2, 1, 1, 30)
     assert run.commit_of(1).attempt == "000001-b-2"  # though another name is smaller
     assert [end.attempt for end in run.ledger.ends()] == ["000001-a-2"]
     # Further specifications and sizes of shards, added one after the other.
     for who, size, seed in (("c", 2, 1), ("d", 3, 1), ("e", 2, 2)):
         fill(tmp_path, who, [0, 1], n=30, size=size, seed=seed)
-    merge(tmp_path, "cd", "parts")
-    merge(tmp_path, "ae", "parts")
-    merge(tmp_path, "acde", "at_once")
-    one, other = (tree(open_storage(tmp_path / name)) for name in ("parts", "at_once"))
-    assert {k: v for k, v in one.items() if "data" not in k} == {
-        k: v for k, v in other.items() if "data" not in k
-    }
+    for names, out in (("cd", "parts"), ("ae", "parts"), ("acde", "at_once")):
+        merge(tmp_path, names, out)
+    one, other = (whole(tmp_path / name) for name in ("parts", "at_once"))
+    assert all(one[key] == data for key, data in other.items() if not key.startswith("data"))
     assert_rows(stored(open_storage(tmp_path / "parts")), stored(open_storage(tmp_path / "at_once")))
-    assert found(tmp_path / "parts") == []
 
 
 def test_a_repaired_attempt_that_another_source_kept_has_one_account(tmp_path: Path) -> None:
@@ -180,37 +158,15 @@ def test_a_repaired_attempt_that_another_source_kept_has_one_account(tmp_path: P
     assert found(tmp_path / "out") == []
 
 
-def test_quarantine_is_kept_for_shards_that_no_source_has(tmp_path: Path) -> None:
-    run = fill(tmp_path, "a", [0])
-    fill(tmp_path, "b", [2])
-    for shard in (1, 2):
-        run.quarantine(QuarantineRecord(
-            shard=shard, seed=0, first_scene=2 * shard, scenes=2, attempts=("x",), causes=("",), stacks=("",),
-            created="",
-        ))  # fmt: skip
-    merge(tmp_path, "ab")
-    assert Run.open(tmp_path / "out").quarantined() == {1}
-
-
-# Several specifications -----------------------------------------------------------------------
-
-
 def test_runs_of_several_specifications_become_parts(tmp_path: Path) -> None:
-    fill(tmp_path, "a", [0, 1], n=20)
-    fill(tmp_path, "b", [0, 2], n=30, seed=1)
     houses = {"houses": Source(kind="procthor", digest="3" * 64)}
     for who, spec in (("c", small_spec(split="val")), ("d", small_spec().model_copy(update=houses))):
         make_run(tmp_path / who, 10, shards=[0], spec=spec)
-    merge(tmp_path, "abcd", "all")
-    assert len(open_runs(tmp_path / "all")) == 4
-    merge(tmp_path, "ab")
+    merge(tmp_path, "cd")
     runs = open_runs(tmp_path / "out")
-    assert [run.manifest.spec_hash for run in runs] == sorted(small_spec(k).hash() for k in (0, 1))
-    counts = label_counts(runs)
-    assert (counts.n, counts.labels, counts.missing) == (50, 40, 1)
-    assert find_scene(runs, 1) == (runs[0], 1) and find_scene(runs, -(-runs[0].n // 5)) == (runs[1], 0)
-    for scene in (-1, 10):
-        with pytest.raises(InputError, match=rf"--scene: {scene} is in none .* Give one from 0 to 9"):
+    assert find_scene(runs, 1) == (runs[0], 1) and find_scene(runs, 2) == (runs[1], 0)
+    for scene in (-1, 4):
+        with pytest.raises(InputError, match=rf"--scene: {scene} is in none .* Give one from 0 to 3"):
             find_scene(runs, scene)
     with pytest.raises(InputError, match=r"holds 2 merged runs, .* Name one of its parts: .*/parts/"):
         Run.open(tmp_path / "out")
@@ -254,61 +210,40 @@ def test_an_interrupted_merge_is_completed_by_the_same_command(tmp_path: Path) -
 
 
 def test_merges_on_s3_give_the_same_files(tmp_path: Path, bucket: str) -> None:
-    layout = Layout(scenes_per_shard=2, candidates_per_scene=5)
     for who, seed, shards in (("a", 0, [0, 1]), ("b", 0, [1, 2]), ("c", 1, [0])):
-        run = Run.create_or_open(open_storage(f"{bucket}/{who}"), manifest_of(small_spec(seed), layout), 40)
-        for shard in shards:
-            assert attempt(run, shard, f"{shard:06d}-{who}")
-    for _ in range(2):
-        merge(bucket, "abc")
+        fill(bucket, who, shards, 40, seed=seed)
+    merge(bucket, "abc")
     merge(bucket, "ab", "ab")
     merge_runs(plan_merge([f"{bucket}/{name}" for name in ("ab", "c")], str(tmp_path / "here")))
     assert whole(f"{bucket}/out") == whole(tmp_path / "here")
 
 
 def test_runs_that_cannot_be_merged_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    """test_merge.py tries other kinds of runs."""
     fill(tmp_path, "a", [0])
-    fill(tmp_path, "b", [1], seed=1)
     fill(tmp_path, "c", [1], size=3)
-    make_run(tmp_path / "d", 20, shards=[0], spec=small_spec(n_points=65, engines={"label": "2"}))
     make_run(tmp_path / "e", 20, candidates_per_scene=4, shards=[0])
+    open_storage(tmp_path / "foreign").put("thesis.tex", b"")
     before = files_of(tmp_path / "a")
-    for other in "bc":
-        with pytest.raises(InputError, match="cannot hold runs of another specification or size of shards"):
-            merge(tmp_path, [other], "a")
-    with pytest.raises(InputError) as refused:
-        merge(tmp_path, "ad")
-    for word in (f"{tmp_path}/a", f"{tmp_path}/d", "engines.label: None and '2'", "n_points: 64 and 65"):
-        assert word in str(refused.value)
-    with pytest.raises(InputError, match="candidates_per_scene: 4 and 5"):
-        merge(tmp_path, "ea")
-    assert not (tmp_path / "out").exists()
-    (tmp_path / "foreign").mkdir()
-    (tmp_path / "foreign" / "thesis.tex").write_text("")
-    with pytest.raises(InputError, match=r"thesis\.tex: holds other files"):
-        merge(tmp_path, "ab", "foreign")
-    for out in ("a/shards", "a/deeper"):
-        with pytest.raises(InputError, match=f"--out: is inside {tmp_path}/a"):
-            merge(tmp_path, "ab", out)
-    with pytest.raises(InputError, match="contains "):
-        merge(tmp_path, ["a", "b"], "")
-    assert files_of(tmp_path / "a") == before
+    for names, out, problem in (
+        ("c", "a", "cannot hold runs of another specification or size of shards"),
+        ("ea", "out", "candidates_per_scene: 4 and 5"),
+        ("a", "foreign", r"thesis\.tex: holds other files"),
+        ("a", "a/shards", f"--out: is inside {tmp_path}/a"),
+        ("ac", "", "contains "),
+    ):
+        with pytest.raises(InputError, match=problem):
+            merge(tmp_path, names, out)
+    assert not (tmp_path / "out").exists() and files_of(tmp_path / "a") == before
 
 
 def test_a_damaged_object_and_another_attempt_of_its_name_are_refused(tmp_path: Path) -> None:
     run = fill(tmp_path, "a", [0])
-    fill(tmp_path, "b", [1])
-    storage = open_storage(tmp_path / "out")
-    storage.put("shards/000000-a-2.zip", b"of another attempt")
-    with pytest.raises(InputError, match=r"out/shards/000000-a-2\.zip: is another attempt of that name"):
-        merge(tmp_path, "ab")
-    assert Run.open(storage).committed() == set()
-    for damage in (lambda p: p.write_bytes(p.read_bytes()[:-1]), Path.unlink):
-        damage(folder_of(run) / "shards/000000-a-2.zip")
-        with pytest.raises(
-            InputError, match=r"a/shards/000000-a-2\.zip: (has \d+ bytes with another|no such file)"
-        ):
-            merge(tmp_path, "ab", "new")
+    for place, problem in (("out", "is another attempt of that name"), ("a", r"has \d+ bytes with another")):
+        open_storage(tmp_path / place).put("shards/000000-a-2.zip", b"of another attempt")
+        with pytest.raises(InputError, match=rf"{place}/shards/000000-a-2\.zip: {problem}"):
+            merge(tmp_path, "a", "out")
+    assert Run.open(tmp_path / "out").committed() == set() and run.committed() == {0}
 
 
 # Conflicts ------------------------------------------------------------------------------------
@@ -337,10 +272,8 @@ def flips(*rows: int) -> Change:
 @pytest.mark.parametrize(
     ("ours", "theirs", "row", "field"),
     [
-        (None, flips(6, 9), 6, "label"),  # the first sample
-        (None, lambda t: (flips(2)(t), sets("distance_m", 2, 0.5)(t)), 2, "distance_m"),  # the first field
+        (None, lambda t: (flips(6, 9)(t), sets("distance_m", 6, 0.5)(t)), 6, "distance_m"),  # the first
         (None, sets("house_id", 1, "another"), 5, "house_id"),
-        (None, sets("redraws", 1, 7), 5, "redraws"),
         (sets("distance_m", 3, 0.0), sets("distance_m", 3, -0.0), 3, "distance_m"),  # bit for bit
     ],
 )
@@ -350,9 +283,9 @@ def test_other_rows_are_refused_naming_the_first_sample_and_field(
     one = changed(tmp_path, "a", 0, ours)
     changed(tmp_path, "b", 0, theirs)
     sample = rows_of(one, 0)[1]["sample_id"][row].tobytes().hex()
-    told = f"a: shard 0: {tmp_path}/b has other rows, first in sample {sample}, in {field}. "
     with pytest.raises(InputError) as refused:
         merge(tmp_path, "ab")
+    told = f"a: shard 0: {tmp_path}/b has other rows, first in sample {sample}, in {field}. "
     assert told in str(refused.value) and not (tmp_path / "out").exists()
 
 
@@ -370,9 +303,6 @@ def test_every_common_scene_of_shards_of_other_sizes_is_compared_and_no_other(tm
         large = changed(tmp_path, f"apart-{size}", 0, flips(5 * scene), size)
         refuse_different_rows(small, 1, large, 0)
         refuse_different_rows(large, 0, small, 1)
-    changed(tmp_path, "odd", 0, flips(15), 4)
-    with pytest.raises(InputError, match=r"odd: shard 0: .*small has other rows, first .*, in label"):
-        merge(tmp_path, ["small", "odd"])
     # Of three sizes: scene 7 is in b and c, whose first common scene is in a too.
     changed(tmp_path, "a", 0, None, 6)
     changed(tmp_path, "b", 1, None, 5)

@@ -1,33 +1,32 @@
-"""Repair restores records and sets shards aside; a resumed run then has the rows of the undamaged one."""
+"""Repair of what bytes alone do not show (see test_damage.py and test_swaps.py), and removal of leftovers."""
 
 from __future__ import annotations
 
+import os
+import platform
 import shutil
-from collections.abc import Callable
+import time
+from collections.abc import Iterable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from datagen.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.checking import repair
-from datagen.schemas.checking.repair import Repaired, repair_runs
+from datagen.schemas.checking.repair import Repaired, clean_runs, repair_runs
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import SCHEMAS
-from datagen.schemas.jobs import JobRecord, Jobs, new_job_id
-from datagen.schemas.record_files import MERGED, commit_key, utc_now
-from datagen.schemas.run import Run, open_runs
+from datagen.schemas.jobs import JobRecord, Jobs, JobState, new_job_id
+from datagen.schemas.record_files import commit_key, utc_now
+from datagen.schemas.run import Run
+from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage, open_storage
-from tests.made_runs import files_of, make_run, small_spec
+from tests.faults.crash_points_operations import remake
+from tests.made_runs import attempt, files_of, flip, make_run, write
 from tests.schemas.checked import (
-    FULL,
     assert_rows,
-    fill,
     folder_of,
     found,
-    merge,
-    resume,
     sealed_run,
     stored,
     tree,
@@ -38,77 +37,6 @@ pytestmark = pytest.mark.usefixtures("few_arrays")
 
 def repair_at(folder: Path) -> Repaired:
     return repair_runs(open_storage(folder, probe=False, create=False))
-
-
-def flip(path: Path) -> str:
-    """Change one bit of a file's last byte; its path below the run."""
-    data = path.read_bytes()
-    path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
-    return str(path)
-
-
-# Damage, repair, resume -----------------------------------------------------------------------
-
-
-def one_run(folder: Path) -> Callable[[Storage], None]:
-    sealed_run(folder / "run", 39)
-    return resume
-
-
-def merged(folder: Path, *runs: tuple[int, int, list[int]]) -> Callable[[Storage], None]:
-    """Merged runs, of seeds, scenes per shard and shards; the merge is complete."""
-    for k, (seed, size, shards) in enumerate(runs):
-        fill(folder, f"r{k}", shards, 40, size, seed)
-    merge(folder, [f"r{k}" for k in range(len(runs))], "run")
-    resume(open_storage(folder / "run"))
-    return resume
-
-
-def relabelled(folder: Path) -> Callable[[Storage], None]:
-    source = make_run(folder / "source", 30, spec=small_spec(engines={"labels": "1"}))
-    spec = relabelled_specification(source, {"heuristic.tau": 0.5})
-
-    def again(storage: Storage) -> None:
-        assert relabel_run(storage, source, spec, json=True).summary.end == "complete"
-
-    again(open_storage(folder / "run"))
-    return again
-
-
-KINDS: dict[str, Callable[[Path], Callable[[Storage], None]]] = {
-    "run": one_run,
-    "merged": lambda folder: merged(folder, (1, 2, [0, 1]), (1, 2, [1, 3])),
-    "parts": lambda folder: merged(folder, (1, 2, [0, 1]), (2, 2, [0, 1, 2])),
-    "overlapping": lambda folder: merged(folder, (1, 2, [2, 3]), (1, 3, [0, 1])),
-    "relabelled": relabelled,
-}
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_repair_and_resume_give_the_rows_of_the_undamaged_run(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if kind == "relabelled":
-        monkeypatch.setitem(SCHEMAS, "heuristic", FULL)
-    again, place = KINDS[kind](tmp_path), tmp_path / "run"
-    rows, rng = stored(open_storage(place)), np.random.default_rng(3)
-    shutil.copytree(place, tmp_path / "whole")
-    for _ in range(6):
-        keys = [key for key in files_of(place) if not key.endswith(".claim")]
-        run = open_runs(place)[0]
-        always = [folder_of(run) / commit_key(0), folder_of(run) / f"shards/{run.commit_of(1).attempt}.zip"]
-        for path in {*always, *(place / key for key in rng.choice(keys, 3, replace=False))}:
-            flip(path)
-        repaired = repair_at(place)
-        left = [(finding.kind, finding.key) for finding in repaired.left]
-        assert left in ([], [("lost", "data.json")]) and found(place) == left
-        assert len(repaired.set_aside) >= 2
-        assert (place / repaired.into / always[0].relative_to(place)).exists()
-        again(open_storage(place))
-        assert_rows(stored(open_storage(place)), rows)
-        assert found(place) == [] and repair_at(place).set_aside == []
-        shutil.rmtree(place)
-        shutil.copytree(tmp_path / "whole", place)
 
 
 def test_a_commit_in_the_place_of_another_leaves_the_shard_that_it_names(tmp_path: Path) -> None:
@@ -127,27 +55,24 @@ def test_a_lost_commit_is_made_again_and_the_store_is_kept_meanwhile(tmp_path: P
     (left,) = repair_at(tmp_path).left
     assert left.kind == "lost" and "datagen resume" in left.fix
     assert files_of(tmp_path / "data.zarr") == store
-    resume(run.storage)
+    remake(folder_of(run))
     assert_rows(stored(run.storage), rows)
     run.grow(39)
-    resume(run.storage)
+    remake(folder_of(run))
     for key in ("plans/2.json", "copies/plans/2.json"):
         (tmp_path / key).unlink()
     (left,) = repair_at(tmp_path).left
     assert left.kind == "stale" and "resume --n" in left.fix and (tmp_path / "data-2.zarr").exists()
 
 
-def test_a_sound_run_is_not_changed_and_an_unfinished_one_is_sealed(tmp_path: Path) -> None:
-    sealed_run(tmp_path / "sound")
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-    repaired = repair_at(tmp_path / "sound")
-    assert (repaired.restored, repaired.set_aside, repaired.resealed) == ([], [], False)
-    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
-    run = make_run(tmp_path / "part", 48, shards=[1, 4])
-    assert repair_at(folder_of(run)).resealed and (folder_of(run) / "data.zarr/zarr.json").exists()
+def test_an_unfinished_run_is_sealed_and_a_sound_one_is_not_changed(tmp_path: Path) -> None:
+    run = make_run(tmp_path, 48, shards=[1, 4])
+    assert repair_at(tmp_path).resealed
+    before = files_of(tmp_path)
+    assert not repair_at(tmp_path).resealed and files_of(tmp_path) == before
     for shard in (1, 4):
-        flip(folder_of(run) / f"shards/a-{shard}.zip")
-    assert [f.kind for f in repair_at(folder_of(run)).left] == ["lost"] and run.committed() == set()
+        flip(tmp_path / f"shards/a-{shard}.zip")
+    assert [f.kind for f in repair_at(tmp_path).left] == ["lost"] and run.committed() == set()
 
 
 def test_a_store_that_cannot_be_made_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,25 +86,13 @@ def test_a_store_that_cannot_be_made_is_reported(tmp_path: Path, monkeypatch: py
     assert (left.key, left.kind) == ("data.zarr", "sealed") and "No space left" in left.fix
 
 
-def test_repair_is_refused_while_a_job_may_be_alive(tmp_path: Path) -> None:
-    run = make_run(tmp_path, 10)
-    record = JobRecord(id=new_job_id(), command=(), host="h", pid=1, started=utc_now(), address="local")
-    Jobs(run.storage).begin(record)
-    with pytest.raises(InputError, match="is running"):
-        repair_runs(run.storage)
-
-
 def test_a_run_on_s3_is_repaired(bucket: str) -> None:
     storage = sealed_run(f"{bucket}/run").storage
-    whole = tree(storage)
-    for key in ("data.zarr/house_id/c.0", "manifest.json", "data.json"):
-        storage.put(key, (whole[key] or b"")[:-1] + b"\0")
-    storage.delete(["data.zarr/label/zarr.json"])
-    storage.put("data.zarr/label/c.7", b"")
+    manifest = storage.get("manifest.json", 10**6)
+    for key in ("data.zarr/house_id/c.0", "manifest.json", "data.json", "data.zarr/label/c.7"):
+        storage.put(key, b"0")
     assert repair_runs(storage).left == [] and found(storage.url) == []
-    assert {k: v for k, v in tree(storage).items() if "data" not in k} == {
-        k: v for k, v in whole.items() if "data" not in k
-    }
+    assert storage.get("manifest.json", 10**6) == manifest
     storage.put("shards/a-1.zip", b"0")
     repaired = repair_runs(storage)
     assert [f.kind for f in repaired.left] == ["lost"] and repaired.set_aside == ["commits/000001.json"]
@@ -187,26 +100,94 @@ def test_a_run_on_s3_is_repaired(bucket: str) -> None:
     assert Run.open(storage).ledger.end_of("a-1").outcome == "superseded"  # type: ignore[union-attr]
 
 
-def test_the_record_of_merged_runs_is_restored(tmp_path: Path) -> None:
-    merged(tmp_path, (1, 2, [0]), (2, 2, [0]))
-    before = files_of(tmp_path / "run")
-    (tmp_path / "run" / MERGED).unlink()
-    assert repair_at(tmp_path / "run").restored == [MERGED]
-    assert files_of(tmp_path / "run") == before
+HOUR_S = 3600
 
 
-def test_a_repair_that_is_interrupted_is_continued_by_the_next(tmp_path: Path) -> None:
-    run = sealed_run(tmp_path, 39)
-    flip(tmp_path / "shards/a-1.zip")
-    plain = Storage.delete
+def littered(folder: Path | str) -> tuple[Run, set[str]]:
+    """A run of five shards, three of them committed, with every kind of garbage; keys of the garbage."""
+    run = make_run(folder, n=50, shards=[0, 1, 2])
+    attempt(run, 1, "late")  # superseded
+    write(run, 3, "never-committed")
+    run.ledger.start("never-committed", 3)
+    seal(run.storage)
+    garbage = {
+        f"commits/000007.json.{'a' * 16}.part",
+        f"shards/x.zip.{'b' * 16}.part",
+        f".probe-{'c' * 16}",
+        "data-2.zarr/label/c.0",
+        "data-2.zarr/zarr.json",
+    }
+    for key in garbage:
+        run.storage.put(key, b"left behind")
+    return run, garbage | {"shards/late.zip", "shards/never-committed.zip"}
 
-    def dies(storage: Storage, keys: Any) -> None:
-        plain(storage, list(keys)[:1])
-        raise KeyboardInterrupt
 
-    for _ in range(2):
-        with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(Storage, "delete", dies)
-            repair_at(tmp_path)
-    assert [f.kind for f in repair_at(tmp_path).left] == ["lost"] and run.committed() == {0, 2, 3}
-    assert list(run.storage.list("shards/a-1.zip")) == []
+def age(run: Run, keys: Iterable[str], seconds: float) -> None:
+    then_s = time.time() - seconds
+    for key in keys:
+        os.utime(folder_of(run) / key, (then_s, then_s))
+
+
+def without(storage: Storage, garbage: Iterable[str]) -> dict[str, bytes | None]:
+    return {key: data for key, data in tree(storage).items() if key not in set(garbage)}
+
+
+@pytest.mark.parametrize("place", ["disk", "s3"])
+def test_garbage_is_removed_and_all_else_keeps_its_bytes(place: str, tmp_path: Path, bucket: str) -> None:
+    run, garbage = littered(tmp_path / "run" if place == "disk" else f"{bucket}/run")
+    before = without(run.storage, garbage)
+    cleaned = clean_runs(run.storage, kept_s=-HOUR_S)
+    assert (cleaned.files, cleaned.attempts) == (len(garbage), 2) and cleaned.bytes > 0
+    assert tree(run.storage) == before and not (tmp_path / "run" / "data-2.zarr").exists()
+    assert len(run.ledger.attempts()) == 5  # all are kept
+    assert clean_runs(run.storage, kept_s=-HOUR_S).files == 0 and found(run.storage.url) == []
+
+
+def test_files_of_the_last_hour_and_stores_that_are_being_written_are_kept(tmp_path: Path) -> None:
+    run, garbage = littered(tmp_path)
+    before = files_of(tmp_path)
+    assert clean_runs(run.storage).files == 0 and files_of(tmp_path) == before
+    age(run, files_of(tmp_path), 2 * HOUR_S)
+    young = {"shards/late.zip", "data-2.zarr/zarr.json"}
+    age(run, young, 60)
+    clean_runs(run.storage)
+    assert files_of(tmp_path).keys() == before.keys() - garbage | young | {"data-2.zarr/label/c.0"}
+
+
+@pytest.mark.parametrize(
+    ("host", "age_h", "is_alive"),
+    [
+        ("h", 0, True),
+        ("elsewhere", 2, True),
+        ("elsewhere", 48, False),
+        # Killed with its clock three years ahead.
+        ("elsewhere", -26_000, False),
+        (platform.node(), -26_000, False),
+    ],
+)
+def test_nothing_is_removed_while_a_job_may_be_alive(
+    host: str, age_h: int, is_alive: bool, tmp_path: Path
+) -> None:
+    run, garbage = littered(tmp_path)
+    before, jobs = files_of(tmp_path), Jobs(run.storage)
+    began = (datetime.now(UTC) - timedelta(hours=age_h)).isoformat()
+    record = JobRecord(id=new_job_id(), command=(), host=host, pid=2**22 + 1, started=began, address="local")
+    jobs.begin(record)
+    (tmp_path / "jobs/20200101T000000-00000000.json").write_bytes(b"damaged")
+    if is_alive:
+        with pytest.raises(InputError, match="is running"):
+            clean_runs(run.storage, kept_s=-60)
+        assert files_of(tmp_path).items() >= before.items()
+        jobs.put_state(JobState(id=record.id, updated=utc_now(), phase="ended", end="complete"))
+    assert clean_runs(run.storage, kept_s=-60).files == len(garbage)
+
+
+def test_nothing_is_removed_where_a_damaged_record_may_name_it(tmp_path: Path) -> None:
+    run, _ = littered(tmp_path)
+    for key in (commit_key(0), "data.json"):
+        whole = (tmp_path / key).read_bytes()
+        (tmp_path / key).write_bytes(b"{}")
+        with pytest.raises(InputError, match=key):
+            clean_runs(run.storage, kept_s=-60)
+        assert all((tmp_path / name).exists() for name in ("shards/a-0.zip", "data.zarr/zarr.json"))
+        (tmp_path / key).write_bytes(whole)

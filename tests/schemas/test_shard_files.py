@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
-import google_crc32c
 import numpy as np
 import pytest
 import xarray
@@ -21,7 +20,7 @@ from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore, ZipStore
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import SCHEMAS, Field, sized_schema
+from datagen.schemas.fields import SCHEMAS, sized_schema
 from datagen.schemas.run_records import Layout
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_files import (
@@ -29,11 +28,10 @@ from datagen.schemas.shard_files import (
     chunk_rows,
     encode_shard,
     group_metadata,
-    zarr_metadata,
+    with_crc32c,
     zipped,
 )
-from datagen.schemas.shard_reading import read_shard
-from datagen.schemas.shard_sources import ZipFiles
+from datagen.schemas.shard_reading import ZipFiles, read_shard
 from tests.made_runs import make_run, rows_of, small_spec, tables_of
 from tests.schemas.checked import assert_rows, check, commit_object, encoded
 
@@ -80,19 +78,6 @@ def test_its_bytes_are_those_that_zarr_writes_and_always_the_same() -> None:
     assert files_in(encode_shard(SCHEMA, LAYOUT, HASH, blank, samples)).keys() == files_in(ours).keys()
 
 
-def test_metadata_of_more_rows_are_those_that_zarr_writes_when_an_array_grows() -> None:
-    attributes: dict[str, Any] = {"said": "größer", "parts": [{"n": 7, "absent": []}]}
-    rows = {"scene": 3 * LAYOUT.scenes_per_shard, "sample": 3 * LAYOUT.samples_per_shard - 1}
-    store = {path: make_buffer(data) for path, data in group_metadata(SCHEMA, LAYOUT, HASH).items()}
-    group = zarr.open_group(MemoryStore(store), mode="r+")
-    for name, array in group.arrays():
-        table = "scene" if name in {f.name for f in SCHEMA.scene_fields} else "sample"
-        array.resize((rows[table], *array.shape[1:]))
-    group.attrs.put(attributes)
-    theirs = {path: buffer.to_bytes() for path, buffer in store.items()}
-    assert zarr_metadata(SCHEMA, LAYOUT, rows, attributes) == theirs
-
-
 def test_large_rows_are_cut_into_equal_chunks_below_the_limit() -> None:
     points = next(f for f in SCHEMAS["heuristic"].scene_fields if f.name == "points_m")
     for rows in (1, 97, 240, 1000):
@@ -109,20 +94,21 @@ def test_labels_of_random_clouds_fit_the_budget(tmp_path: Path) -> None:
         assert sum(file.size for file in run.storage.list(folder)) / 600 < 400e6 / 180_000
 
 
-@pytest.mark.parametrize(
-    ("name", "change", "problem"),
-    [
-        ("label", lambda a: a[:-1], "shape"),
-        ("label", lambda a: a.astype(np.int64), "dtype"),
-        ("label", lambda a: a + np.uint8(2), "above 1"),
-        ("visibility", lambda a: a * np.float32("nan"), "NaN"),
-        ("distance_m", lambda a: a - np.float32(1e4), "below"),
-        ("label_source", lambda a: np.array([1] * len(a), object), "is not valid text"),
-        ("label_source", lambda a: np.array(["\ud800"] * len(a), object), "is not valid text"),
-        ("label_source", lambda a: np.array(["x" * 5000] * len(a), object), "is not valid text"),
-        ("label", None, "missing or unknown"),
-    ],
+BROKEN: tuple[tuple[str, Callable[[np.ndarray], np.ndarray] | None, str], ...] = (
+    ("label", lambda a: a[:-1], "shape"),
+    ("label", lambda a: a.astype(np.int64), "dtype"),
+    ("label", lambda a: a + np.uint8(2), "above 1"),
+    ("label", None, "missing or unknown"),
+    ("visibility", lambda a: a * np.float32("nan"), "NaN"),
+    ("distance_m", lambda a: a - np.float32(1e4), "below"),
+    *(
+        ("label_source", lambda a, text=text: np.array([text] * len(a), object), "is not valid text")
+        for text in (1, "\ud800", "x" * 5000)
+    ),
 )
+
+
+@pytest.mark.parametrize(("name", "change", "problem"), BROKEN)
 def test_a_batch_that_breaks_the_schema_is_refused(
     name: str, change: Callable[[np.ndarray], np.ndarray] | None, problem: str
 ) -> None:
@@ -131,13 +117,6 @@ def test_a_batch_that_breaks_the_schema_is_refused(
     with pytest.raises(InputError, match=problem) as e:
         encode_shard(SCHEMA, LAYOUT, HASH, scenes, samples | ({name: change(values)} if change else {}))
     assert e.value.field == name
-
-
-def test_metadata_follows_the_fields_and_not_only_the_name_of_the_schema() -> None:
-    more = Field("extra", "float32", (), "m", "", "added in a later version")
-    longer = type(SCHEMA)(SCHEMA.name, 2, SCHEMA.scene_fields, (*SCHEMA.sample_fields, more), SCHEMA.sizes)
-    files = set(group_metadata(longer, LAYOUT, HASH))
-    assert files - set(group_metadata(SCHEMA, LAYOUT, HASH)) == {"extra/zarr.json"}
 
 
 # Hostile objects, whose commit has their digest -----------------------------------------------
@@ -170,31 +149,21 @@ def _far_offset(files: Files) -> bytes:
     return data[:start] + directory + data[end : end + 12] + struct.pack("<II", size + 12, start) + b"\0\0"
 
 
-def _bomb(content_bytes: int) -> Callable[[Files], bytes]:
-    packed = bytes(Zstd(level=3).encode(bytes(content_bytes)))
-    chunk = packed + google_crc32c.value(packed).to_bytes(4, "little")
-    return lambda files: zipped({**files, "house_id/c.0": chunk, "points_m/c.0.0.0": chunk})
+def _of_other_size(files: Files) -> bytes:
+    chunk = with_crc32c(bytes(Zstd(level=3).encode(bytes(3))))
+    return zipped({**files, "house_id/c.0": chunk, "points_m/c.0.0.0": chunk})
 
 
 HOSTILE: dict[str, Callable[[Files], bytes]] = {
-    "compressed": lambda files: entries(files, zipfile.ZIP_DEFLATED),
     "bzip2": lambda files: entries(files, zipfile.ZIP_BZIP2),
     "encrypted": lambda files: _patched(files, 8, b"\1\0"),
-    "patch data": lambda files: _patched(files, 8, b"\x20\0"),
-    "no shard": lambda files: b"no zip",
-    "empty": lambda files: b"",
     "truncated": lambda files: zipped(files)[: len(zipped(files)) // 2],
-    "without end": lambda files: zipped(files)[:-1],
     "offset beyond the file": lambda files: _patched(files, 42, b"\xf0\xff\xff\x7f"),
     "offset beyond any file": _far_offset,
-    "directory beyond the file": lambda files: zipped(files)[:-10] + b"\xff" * 4 + zipped(files)[-6:],
-    "long member": lambda files: _patched(files, 20, b"\xff\xff\xff\x7f" * 2),
     "bad checksum": lambda files: _patched(files, 16, b"\0" * 4),
     "missing member": lambda files: zipped({k: v for k, v in files.items() if k != "label/c.0"}),
-    "bomb": _bomb(2**28),
-    "small chunk": _bomb(3),
+    "small chunk": _of_other_size,
     "other metadata": lambda files: zipped({**files, "label/zarr.json": files["distance_m/zarr.json"]}),
-    "metadata that is none": lambda files: zipped({**files, "label/zarr.json": b"[" * 10**5}),
 }
 ODD: dict[str, Callable[[Files], bytes]] = {  # readers find what they need
     "extra member": lambda files: zipped({**files, "../../odd": b"x"}),

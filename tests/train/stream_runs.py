@@ -9,7 +9,7 @@ import numpy as np
 
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
-from datagen.schemas.shard_files import chunk_key, encode_chunk, encode_shard
+from datagen.schemas.shard_files import chunk_path, encode_chunk, encode_shard
 from datagen.schemas.storage import open_storage
 from tests.made_runs import Tables, commit_of, manifest_of, rows_of, small_spec, with_files
 
@@ -39,7 +39,7 @@ def make_stream_run(
         for field in (*run.schema.scene_fields, *run.schema.sample_fields):
             if field.name in changes:
                 values = np.full_like((scenes | samples)[field.name], changes[field.name])
-                changed[f"{field.name}/{chunk_key(field, 0)}"] = encode_chunk(field, values)
+                changed[chunk_path(field.name, 0, len(field.dims))] = encode_chunk(field, values)
         entry = run.write_object(f"a-{shard}", with_files(data, changed))
         assert run.commit(commit_of(run, shard, f"a-{shard}", entry, int(samples["label"].sum())))
     return run

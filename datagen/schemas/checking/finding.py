@@ -25,25 +25,15 @@ Record = TypeVar("Record", bound=BaseModel)
 
 
 @dataclass(frozen=True)
-class Restore:
-    """Write these bytes, which come from a second copy or follow from other records."""
-
-    data: bytes
-
-
-@dataclass(frozen=True)
 class SetAside:
     """Move the finding's shard of this run out of its records, or, without a run, the finding's file."""
 
     run: Run | None = None
 
 
-@dataclass(frozen=True)
-class Reseal:
-    """Make data.zarr again."""
-
-
-Cure = Restore | SetAside | Reseal
+RESEAL = "reseal"  # make data.zarr again
+# Bytes: write them as the file. They come from a second copy, or follow from other records.
+Cure = bytes | SetAside | Literal["reseal"]
 
 
 @dataclass(frozen=True)
@@ -57,15 +47,15 @@ class Finding:
     shard: int | None = None
     cure: Cure | None = None
 
-    @property
-    def is_damage(self) -> bool:
-        """Whether data is damaged; an outdated sealed store is not damage."""
-        return self.kind != "stale"
-
 
 def below(prefix: str, findings: Iterable[Finding]) -> Iterator[Finding]:
     """The findings with keys relative to the merged runs, which hold their run in the folder `prefix`."""
     return (replace(finding, key=prefix + finding.key) for finding in findings)
+
+
+def folder_of(storage: Storage, place: Storage) -> str:
+    """The folder of a run's storage relative to that of merged runs, with a slash; "" for the same one."""
+    return f"{place.url.removeprefix(storage.url)}/".lstrip("/")
 
 
 def curable(key: str, kind: Kind, problem: str, cure: Cure, shard: int | None = None) -> Finding:
@@ -125,7 +115,7 @@ def compare(
         return [Finding(ours.key, "record", f"differs from its copy {copy.key}", fix, shard)]
     for bad, good in ((copy, ours), (ours, copy)):
         if good.record is not None and good.data is not None:
-            return [curable(bad.key, "record", bad.problem, Restore(good.data), shard)]
+            return [curable(bad.key, "record", bad.problem, good.data, shard)]
     damaged = [one for one in (ours, copy) if one.problem != "missing"]
     return [Finding(one.key, "record", f"{one.problem}, as is its copy", BACKUP, shard) for one in damaged]
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.merging.plan import (
@@ -56,8 +57,7 @@ class MergePlan:
         return sum(len(part.kept) for part in self.parts)
 
 
-@dataclass(frozen=True, eq=False)
-class WrittenPart:
+class WrittenPart(NamedTuple):
     """The result of a part. `there` counts shards that existed before, `spare` those of several sources."""
 
     run: Run
@@ -66,8 +66,7 @@ class WrittenPart:
     spare: int
 
 
-@dataclass(frozen=True, eq=False)
-class MergeResult:
+class MergeResult(NamedTuple):
     """The result of a merge; `sealed` is the store's address, "" where nothing is committed."""
 
     storage: Storage
@@ -83,11 +82,14 @@ def plan_merge(paths: Sequence[str], out: str, tick: Tick = lambda: None) -> Mer
     """
     if not paths:
         raise InputError("datagen merge", "RUN", "is missing", "Name the runs to merge")
-    storage = _existing_storage(out)
-    existing, is_merged = list[Run](), False
-    if storage is not None:
+    storage, existing, is_merged = None, list[Run](), False
+    try:
+        storage = open_storage(out, probe=False, create=False)
         is_merged = storage.exists(MERGED)
         existing = open_runs(storage) if is_merged or storage.exists("manifest.json") else []
+    except InputError as e:
+        if e.problem != "no such folder":
+            raise
     sources = [run for path in paths for run in open_runs(path)]
     refuse_incompatible([*existing, *sources])
     _refuse_nested(paths, out, existing, sources)
@@ -190,16 +192,6 @@ def _copy_records(sources: Sequence[Run], run: Run, but: Container[str]) -> None
         keys = sorted(key for key, runs in held.items() if runs[0] is source)
         for _ in run.storage.concurrent_map(put, source.storage.get_many(keys, MAX_RECORD_BYTES)):
             pass
-
-
-def _existing_storage(out: str) -> Storage | None:
-    """The storage of the result; None where the folder does not exist yet."""
-    try:
-        return open_storage(out, probe=False, create=False)
-    except InputError as e:
-        if e.problem == "no such folder":
-            return None
-        raise
 
 
 def _address(path: str) -> str:

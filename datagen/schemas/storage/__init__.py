@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -160,10 +161,8 @@ def open_storage(path: str | Path, probe: bool = True, create: bool = True) -> S
 
         storage = Storage(RemoteObjects(text))
     elif colon and scheme != "file":
-        problem = "is neither a folder nor an s3:// address"
-        raise InputError(
-            f"{scheme}://...", "", problem, "Name a folder or an s3:// address that you can write"
-        )
+        fix = "Name a folder or an s3:// address that you can write"
+        raise InputError(f"{scheme}://...", "", "is neither a folder nor an s3:// address", fix)
     else:
         folder = Path(rest if colon else text).expanduser().absolute()
         refuse_not_utf8(str(folder))  # records contain it
@@ -195,12 +194,9 @@ def _probe(storage: Storage) -> None:
     key = f".probe-{secrets.token_hex(8)}"
     try:
         if not storage.put_new(key, b"first") or storage.put_new(key, b"second"):
-            raise InputError(
-                storage.url,
-                "",
-                "does not support create-only writes, so two jobs could overwrite each other",
-                "Use a local disk or an object store with conditional writes",
-            )
+            problem = "does not support create-only writes, so two jobs could overwrite each other"
+            fix = "Use a local disk or an object store with conditional writes"
+            raise InputError(storage.url, "", problem, fix)
     finally:
         storage.delete([key])
 
@@ -225,15 +221,12 @@ def concurrent_map(
     The first exception ends it; no call is running after the iterator has ended. `items` is consumed in the
     caller's thread, as needed. `do` must not wait for the pool that it runs in.
     """
-    begun: deque[Future[Result]] = deque()
+    begun, left = deque[Future[Result]](), iter(items)
     try:
-        for item in items:
-            begun.append(pool.submit(do, item))
-            if len(begun) >= most:
-                result = begun[0].result()
-                begun.popleft()
-                yield result
-        while begun:
+        while True:
+            begun.extend(pool.submit(do, item) for item in islice(left, most - len(begun)))
+            if not begun:
+                return
             result = begun[0].result()
             begun.popleft()
             yield result

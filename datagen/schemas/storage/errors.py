@@ -36,50 +36,24 @@ _OTHER_FIX = "Check that the path exists, is reachable and can be written"
 
 _RESUME = "then continue with `datagen resume`"
 _KEYS_FIX = "Check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, and what they allow in this bucket"
+_FULL_FIX = f"Free space in the store or raise its quota, {_RESUME}"
 _REGION_FIX = "Set AWS_REGION to the bucket's region, or AWS_ENDPOINT_URL to its store"
-# Problem and fix by the server's error code.
-_ADVICE = {
-    code: (problem, fix)
-    for codes, problem, fix in (
-        (
-            "NoSuchBucket",
-            "no such bucket",
-            "Create the bucket, or check its name, AWS_ENDPOINT_URL and AWS_REGION",
-        ),
-        (
-            "ExpiredToken ExpiredTokenException TokenRefreshRequired",
-            "the credentials have expired",
-            f"Set new AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_SESSION_TOKEN, {_RESUME}",
-        ),
-        ("InvalidAccessKeyId", "access denied", "Check AWS_ACCESS_KEY_ID: the store does not know it"),
-        (
-            "SignatureDoesNotMatch",
-            "access denied",
-            "Check AWS_SECRET_ACCESS_KEY: it does not belong to the key's id",
-        ),
-        (
-            "AccessDenied",
-            "access denied",
-            "Allow AWS_ACCESS_KEY_ID to get, put, delete and list in this bucket; see also its retention",
-        ),
-        (
-            "RequestTimeTooSkewed RequestExpired",
-            "this machine's clock differs from the store's",
-            "Set the clock: timedatectl set-ntp true",
-        ),
-        (
-            "AuthorizationHeaderMalformed IllegalLocationConstraintException PermanentRedirect InvalidRegion",
-            "the bucket is in another region",
-            _REGION_FIX,
-        ),
-        (
-            "QuotaExceeded XMinioAdminBucketQuotaExceeded XMinioStorageFull InsufficientStorage",
-            "the store is full",
-            f"Free space in the store or raise its quota, {_RESUME}",
-        ),
-    )
-    for code in codes.split()
-}
+_NEW_KEYS = f"Set new AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_SESSION_TOKEN, {_RESUME}"
+_ALLOW = "Allow AWS_ACCESS_KEY_ID to get, put, delete and list in this bucket; see also its retention"
+# Codes of servers, problem and fix.
+_KNOWN = (
+    ("NoSuchBucket", "no such bucket", "Create the bucket, or check its name and AWS_ENDPOINT_URL"),
+    ("ExpiredToken ExpiredTokenException TokenRefreshRequired", "the credentials have expired", _NEW_KEYS),
+    ("InvalidAccessKeyId", "access denied", "Check AWS_ACCESS_KEY_ID: the store does not know it"),
+    ("SignatureDoesNotMatch", "access denied", "Check AWS_SECRET_ACCESS_KEY: it is not that of the key's id"),
+    ("AccessDenied", "access denied", _ALLOW),
+    ("RequestTimeTooSkewed RequestExpired", "this machine's clock differs from the store's", "Set the clock"),
+    ("AuthorizationHeaderMalformed PermanentRedirect", "the bucket is in another region", _REGION_FIX),
+    ("IllegalLocationConstraintException InvalidRegion", "the bucket is in another region", _REGION_FIX),
+    ("QuotaExceeded XMinioAdminBucketQuotaExceeded", "the store is full", _FULL_FIX),
+    ("XMinioStorageFull InsufficientStorage", "the store is full", _FULL_FIX),
+)
+_ADVICE = {code: (problem, fix) for codes, problem, fix in _KNOWN for code in codes.split()}
 _ENDPOINT_FIX = f"Check AWS_ENDPOINT_URL and the network, {_RESUME}"
 _TRUSTED = r"[A-Za-z][A-Za-z0-9.]{0,60}"
 
@@ -162,12 +136,9 @@ def machine_error(error: BaseException | None, codes: Sequence[int] = MACHINE) -
 
 def too_large(place: str, size: int, limit_bytes: int) -> FileTooLarge:
     """The error for a file above the limit."""
-    return FileTooLarge(
-        place,
-        "",
-        f"has {size} bytes, more than the {limit_bytes} that such a file can have",
-        "It was not written by datagen: restore the run from a copy, or remove the file",
-    )
+    problem = f"has {size} bytes, more than the {limit_bytes} that such a file can have"
+    fix = "It was not written by datagen: restore the run from a copy, or remove the file"
+    return FileTooLarge(place, "", problem, fix)
 
 
 def store_trouble(error: Exception) -> RequestFailure:

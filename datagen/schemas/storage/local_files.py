@@ -17,12 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from datagen.schemas.safe_files import sync_folder
-from datagen.schemas.storage.errors import (
-    TAKEN,
-    NotARegularFile,
-    storage_error,
-    too_large,
-)
+from datagen.schemas.storage.errors import TAKEN, NotARegularFile, storage_error, too_large
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 # Enough to traverse a folder, without permission to read it.
@@ -94,34 +89,27 @@ class LocalFiles:
         return True
 
     def get(self, key: str, limit_bytes: int) -> bytes | None:
-        try:
-            fd = self._open_file(key)
-        except FileNotFoundError:
-            return None
-        with _closing(fd):
+        with suppress(FileNotFoundError), _closing(self._open_file(key)) as fd:
             size = os.fstat(fd).st_size
             if size > limit_bytes:
                 raise too_large(f"{self.folder}/{key}", size, limit_bytes)
-            return _read(fd, size)
+            with open(fd, "rb", closefd=False) as file:
+                return file.read(size)
+        return None
 
     def get_range(self, key: str, start: int, size: int) -> bytes | None:
-        try:
-            fd = self._open_file(key)
-        except FileNotFoundError:
-            return None
-        with _closing(fd):
+        with suppress(FileNotFoundError), _closing(self._open_file(key)) as fd:
             end = os.fstat(fd).st_size
             return os.pread(fd, min(size, end), start if start >= 0 else max(0, end + start))
+        return None
 
     def exists(self, key: str) -> bool:
         folders, name = _split(key)
-        try:
-            with _closing(self._walk(folders)) as here:
-                mode = os.stat(name, dir_fd=here, follow_symlinks=False).st_mode
-        except FileNotFoundError:
-            return False
-        self._refuse_odd(mode, key)
-        return stat.S_ISREG(mode)
+        with suppress(FileNotFoundError), _closing(self._walk(folders)) as here:
+            mode = os.stat(name, dir_fd=here, follow_symlinks=False).st_mode
+            self._refuse_odd(mode, key)
+            return stat.S_ISREG(mode)
+        return False
 
     def list(self, prefix: str) -> Iterator[StoredFile]:
         """All files below a folder; none when it does not exist. InputError for links, pipes, devices."""
@@ -264,26 +252,10 @@ def _step(name: str, here: int, make: bool, flags: int) -> int:
                 os.mkdir(name, dir_fd=here)
 
 
-def _read(fd: int, size: int) -> bytes:
-    """Read the first `size` bytes, or fewer."""
-    data = os.read(fd, size)
-    if len(data) == size:
-        return data
-    parts = [data]  # one call reads at most 2 GiB
-    while data and (size := size - len(data)):
-        data = os.read(fd, size)
-        parts.append(data)
-    return b"".join(parts)
-
-
 def _write(draft: str, data: bytes, folder: int, durably: bool) -> None:
+    left = memoryview(data)
     with _closing(os.open(draft, _DRAFT, 0o666, dir_fd=folder)) as fd:
-        _write_all(fd, data)
+        while left:
+            left = left[os.write(fd, left) :]
         if durably:
             os.fsync(fd)
-
-
-def _write_all(fd: int, data: bytes) -> None:
-    left = memoryview(data)
-    while left:
-        left = left[os.write(fd, left) :]

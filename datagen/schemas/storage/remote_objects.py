@@ -21,13 +21,7 @@ from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import S3Store
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.storage.errors import (
-    RequestFailure,
-    store_trouble,
-    tell_repetition,
-    too_large,
-    waits_s,
-)
+from datagen.schemas.storage.errors import RequestFailure, store_trouble, tell_repetition, too_large, waits_s
 from datagen.schemas.storage.local_files import StoredFile
 
 TIMEOUT_S = 20.0  # seconds without a response after which a request fails
@@ -151,10 +145,7 @@ class RemoteObjects:
                 raise _TransientTrouble("the store's response is cut off")
             return data
 
-        try:
-            return self._try(key, get)
-        except FileNotFoundError:
-            return None
+        return self._found(key, get)
 
     def get_range(self, key: str, start: int, size: int) -> bytes | None:
         part: Any = {"range": (start, start + size) if start >= 0 else {"suffix": -start}}
@@ -167,17 +158,10 @@ class RemoteObjects:
                     return b""
                 raise
 
-        try:
-            return self._try(key, get)
-        except FileNotFoundError:
-            return None
+        return self._found(key, get)
 
     def exists(self, key: str) -> bool:
-        try:
-            self._try(key, lambda: obstore.head(self._store, key))
-        except FileNotFoundError:
-            return False
-        return True
+        return self._found(key, lambda: obstore.head(self._store, key)) is not None
 
     def list(self, prefix: str) -> Iterator[StoredFile]:
         """All objects below a prefix (without its closing slash), in order of their keys."""
@@ -202,10 +186,7 @@ class RemoteObjects:
     def delete(self, keys: Iterable[str]) -> None:
         left = iter(keys)
         while some := list(islice(left, _DELETED_AT_ONCE)):
-            try:
-                self._try(some[0], lambda some=some: obstore.delete(self._store, some))
-            except FileNotFoundError:
-                continue
+            self._found(some[0], lambda some=some: obstore.delete(self._store, some))
 
     def _open(self, prefix: str) -> Any:
         timeout = timedelta(seconds=self._timeout_s)
@@ -221,6 +202,13 @@ class RemoteObjects:
         except _FAILURES as e:
             problem = "the AWS_* environment variables cannot be used"
             raise InputError(self.url, "", problem, "Check their spelling and values") from e
+
+    def _found(self, key: str, request: Callable[[], Result]) -> Result | None:
+        """Run a request with retries; None for a missing object."""
+        try:
+            return self._try(key, request)
+        except FileNotFoundError:
+            return None
 
     def _try(self, key: str, request: Callable[[], Result]) -> Result:
         """Run a request with retries; FileNotFoundError for a missing object."""

@@ -15,8 +15,8 @@ from functools import cached_property
 import numpy as np
 
 from datagen.schemas.errors import InputError
+from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.identity import Stream, generator
-from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import ArmParams, DisturbanceParams, Specification
 from datagen.workers.bases.candidates import SceneCandidates

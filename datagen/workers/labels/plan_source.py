@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import SceneCandidates

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.fields import REDRAW_CAUSES
 from datagen.schemas.specification import SceneParams
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.planar import convex_hull, stack_polygons

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from datagen.evaluation.columns import Columns
-from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.fields import OUTCOMES
 
 
 def make_columns(

@@ -14,7 +14,7 @@ import pytest
 from datagen import cli
 from datagen.evaluation import arrival_outcomes
 from datagen.evaluation.arrival_outcomes import SceneTask, read_outcomes
-from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.run import Run
 from tests.refusals import refused
 from tests.sim_extra import needs_sim

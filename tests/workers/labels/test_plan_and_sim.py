@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.fields import OUTCOMES, RETRY_OUTCOMES, SCHEMAS
 from datagen.schemas.identity import Stream, generator
-from datagen.schemas.outcomes import OUTCOMES, RETRY_OUTCOMES
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import (
     ArmParams,
