@@ -16,6 +16,7 @@ from datagen.display.progress import Pace, Progress, clock_text, whole
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, JobState, new_job_id
 from datagen.schemas.record_files import utc_now
+from datagen.schemas.storage.errors import StoreUnavailable
 
 # Environment variables of a detached job: its submission id at Ray, and the address of Ray's Jobs API.
 SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"
@@ -159,11 +160,16 @@ class JobRecorder:
         self._put(phase="making", labels_per_s=labels_per_s, left_s=left_s, stopping=stopping, **counts)
 
     def pass_on_request(self, stop: StopRequest) -> None:
-        """Make the request of another process, if any; one that a signal has made before counts once."""
-        with suppress(InputError):
-            if (asked := self._jobs.stop_of(self._state.id)) is not None:
-                while not (stop.force if asked == "now" else stop.drain):
-                    stop.ask()
+        """Make the request of another process, if any; one that a signal has made before counts once.
+
+        Where the store fails, no attempt of a stopped job can commit: it stops at once.
+        """
+        try:
+            asked = self._jobs.stop_of(self._state.id)
+        except InputError as error:
+            asked = "now" if stop.drain and isinstance(error, StoreUnavailable) else None
+        while asked is not None and not (stop.force if asked == "now" else stop.drain):
+            stop.ask()
 
     def seal(self) -> None:
         """Publish that the shards are made and the store is being sealed."""
