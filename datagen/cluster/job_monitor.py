@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Callable
 from contextlib import suppress
 
 from datagen.cluster.attempt_guard import running_attempts
@@ -95,7 +96,10 @@ class JobProgress:
 
 
 class JobMonitor(JobProgress):
-    """A driver's events, shown and published every `BEAT_S`; looks for requests to stop every `LOOK_S`."""
+    """A driver's events, shown and published every `BEAT_S`; looks for requests to stop every `LOOK_S`.
+
+    `check` raises InputError where the job must end; it is called as often.
+    """
 
     def __init__(
         self,
@@ -105,8 +109,10 @@ class JobMonitor(JobProgress):
         labels_per_shard: int,
         done_before: int = 0,
         notes: str = "",
+        check: Callable[[], None] = lambda: None,
     ) -> None:
         super().__init__(shown, labels_per_shard, done_before, notes)
+        self._check = check
         self._recorder, self._stop, self._clock = recorder, stop, shown.clock
         self._next_beat_s = self._next_look_s = self._clock()
 
@@ -119,6 +125,7 @@ class JobMonitor(JobProgress):
         now_s = self._clock()
         if now_s >= self._next_look_s:
             self._next_look_s = now_s + LOOK_S
+            self._check()
             self._recorder.pass_on_request(self._stop)
         if now_s >= self._next_beat_s:
             self._next_beat_s = now_s + BEAT_S

@@ -40,7 +40,7 @@ from datagen.display.progress import Progress
 from datagen.jobs.job_report import JobResult
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobEnd, Jobs
-from datagen.schemas.run import Run
+from datagen.schemas.run import Run, RunReplaced
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage
 from datagen.schemas.storage.errors import JOBS_WAIT_S, repeated_for_minutes, repeated_until
@@ -143,7 +143,7 @@ class Job:
             until_s = time.monotonic() + (0.0 if end == "interrupted" else _RECORDED_WITHIN_S)
             with repeated_until(lambda: until_s):
                 recorder.end(end, code, " ".join(str(error).split())[:1000])
-            if isinstance(error, InputError) and not isinstance(error, _CannotContinue):
+            if isinstance(error, InputError) and not isinstance(error, _CannotContinue | RunReplaced):
                 fix = f"{error.fix}. Then resume: {command_line(self.resume)}"
                 raise InputError(error.place, error.field, error.problem, fix) from error
             raise
@@ -206,7 +206,7 @@ class Job:
 
         shown.phase("making labels")
         done = len(run.planned()) - len(shards)
-        events = JobMonitor(recorder, stop, shown, layout.samples_per_shard, done, notes)
+        events = JobMonitor(recorder, stop, shown, layout.samples_per_shard, done, notes, run.refuse_replaced)
         policy = self.policy
         if run.storage.folder is None:  # attempts that wait for the store are not hung
             policy = replace(policy, min_deadline_s=policy.min_deadline_s + JOBS_WAIT_S)
@@ -238,6 +238,8 @@ class Job:
 
         The driver knows only its own shards, which may be the last two of a thousand.
         """
+        for job_run in self.runs:
+            job_run.run.refuse_replaced()
         if summary.end not in ("complete", "failed") or summary.remaining:
             return summary
         quarantined = planned = 0
