@@ -126,4 +126,4 @@ def test_a_stopped_server_keeps_no_submit_at_its_end(tmp_path: Path, joined: Joi
     assert "does not disconnect within" in job.err
     run = Run.open(out)
     assert run.quarantined() == set() and run.missing()
-    assert [job.state.phase for job in Jobs(run.storage).all()] == ["ended"]
+    assert [job.health() for job in Jobs(run.storage).all()] == ["ended"]
