@@ -35,7 +35,7 @@ _TOKEN_FIX = (
     "Set RAY_AUTH_TOKEN to the token that the cluster was started with, or RAY_AUTH_TOKEN_PATH to its file"
 )
 
-_START_WITHIN_S, _END_WITHIN_S = 300.0, 30.0
+_START_WITHIN_S, _END_WITHIN_S = 300.0, 20.0
 _LOOK_S = 0.05
 # Files in which the raylet expects the ports of its agents. Port 1 is never connected to.
 _AGENT_PORTS = (
@@ -106,6 +106,7 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
         start.close()
         # Private: Ray prints a paragraph for each dead worker; the driver reports it already.
         ray._private.worker._worker_logs_enabled = False  # pyright: ignore
+        ray._private.worker._unhandled_error_handler = lambda error: None  # pyright: ignore
         ending = threading.Thread(target=ray.shutdown, daemon=True, name=ENDING_RAY)
         whole.callback(_end, ending, settings.tell)
         yield ray

@@ -93,7 +93,7 @@ def ended(command: list[str], cluster: Joined, is_due: Callable[[], bool], harm:
         time.sleep(0.05)
     harm()
     out, err = job.communicate(timeout=800)
-    assert "Traceback" not in err and "rpc_client" not in err, err
+    assert "Traceback" not in err and "rpc_client" not in err and "Unhandled" not in err, err
     return Ended(job.returncode, out, err)
 
 
