@@ -76,7 +76,7 @@ slow: venv
 
 # Each ends with an error where a promise was broken.
 FAULTS := crash_points damage kills executors two_drivers s3 confinement swaps storage_errors power_cut \
-	hostile_files hostile_meshes histories many_scenes
+	hostile_files hostile_meshes histories many_scenes many_commits
 faults: venv
 	@set -e; for name in $(FAULTS); do echo; echo "== $$name"; $(BIN)/python -m benchmarks.faults.$$name; done
 	@echo; echo "== driver"; $(BIN)/python -m benchmarks.driver

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+import threading
 from difflib import get_close_matches
 from inspect import getdoc
 from typing import TYPE_CHECKING
@@ -23,7 +24,7 @@ from cyclopts.exceptions import (
 )
 
 from datagen import __version__
-from datagen.cluster.environment import job_environment
+from datagen.cluster.environment import ENDING_RAY, job_environment
 from datagen.console.command_lines import PRINTER, Interrupted, begin_with_process
 from datagen.console.printing import drop_output
 from datagen.display.observers import LossyStream
@@ -222,6 +223,8 @@ def main() -> None:
     begin_with_process()
     with job_environment():
         code = run(sys.argv[1:])
+    if any(thread.name == ENDING_RAY for thread in threading.enumerate()):
+        os._exit(code)  # the end of the interpreter would wait for Ray's stopped servers too
     sys.exit(code)
 
 

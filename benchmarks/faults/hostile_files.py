@@ -57,7 +57,7 @@ def houses_cases(folder: Path) -> Iterator[Case]:
         home = write_houses(folder / f"houses {name}", [])
         (home / "houses.jsonl.gz").write_bytes(make())
         yield Case("submit --houses", name, [*submit, "--houses", f"procthor:{home}"])
-    for name in ("houses.jsonl.gz", "houses.jsonl", "houses.json", "asset_sizes.json"):
+    for name in ("houses.jsonl.gz", "houses.jsonl", "source.json", "asset_sizes.json"):
         for kind, put in ODD_FILES.items():
             home = write_houses(folder / f"houses {kind} {name}", [two_rooms()], name="good.jsonl")
             (home / name).unlink(missing_ok=True)

@@ -80,14 +80,14 @@ def download(
         raise InputError(url, "", "is not an http(s) address", "Give one with --mirror")
     target.parent.mkdir(parents=True, exist_ok=True)
     part = _PartialFile(target, url)
-    failures = 0
+    failures, most = 0, part.length
     while True:
-        before = part.length
-        resumed = before > 0
+        resumed = part.length > 0
         try:
             _transfer(url, part, size, max_bytes, sha256 is not None, progress, policy.timeout_s)
         except _TransientFailure as error:
-            failures = 0 if part.length > before else failures + 1
+            # A download that starts over has made no progress before it is longer than ever.
+            failures, most = (0, part.length) if part.length > most else (failures + 1, most)
             if failures >= policy.tries:
                 raise InputError(
                     url,

@@ -12,7 +12,7 @@ from datagen.cluster.preflight import refuse_other_code, refuse_unfit_machine
 from datagen.cluster.protocol import AttemptResult, JobCannotContinue, ShardTask, UnfitMachine
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import commit_key, utc_now
-from datagen.schemas.run import Run
+from datagen.schemas.run import Run, RunReplaced
 from datagen.schemas.run_records import Commit
 from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.shard_reading import read_scenes
@@ -75,7 +75,7 @@ def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:
 
 @contextmanager
 def ends_job(every_input_error: bool = False) -> Generator[None]:
-    """Raise JobCannotContinue for a full disk, and UnfitMachine for one that cannot be written.
+    """Raise JobCannotContinue for a full disk or a replaced run, and UnfitMachine for a read-only one.
 
     Optionally also UnfitMachine for any InputError, except from a store that does not respond.
     """
@@ -83,6 +83,8 @@ def ends_job(every_input_error: bool = False) -> Generator[None]:
         yield
     except StoreUnavailable:
         raise
+    except RunReplaced as error:
+        raise JobCannotContinue(str(error)) from error
     except (InputError, OSError) as error:
         if (full := machine_error(error, FULL)) is not None:
             raise JobCannotContinue(str(full)) from error

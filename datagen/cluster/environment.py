@@ -14,6 +14,8 @@ from pathlib import Path
 
 # Path of the file, for a detached job.
 JOB_ENVIRONMENT = "DATAGEN_JOB_ENVIRONMENT"
+# Name of the thread that disconnects from Ray. Where it is left behind, the interpreter's end would wait too.
+ENDING_RAY = "ending Ray"
 _OF_THE_SHELL = ("AWS_", "DATAGEN_", "XDG_CACHE_HOME")
 
 

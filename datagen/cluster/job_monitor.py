@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Callable
 from contextlib import suppress
 
 from datagen.cluster.attempt_guard import running_attempts
@@ -16,6 +17,7 @@ from datagen.display.progress import Pace, Progress, clock_text, whole
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, JobState, new_job_id
 from datagen.schemas.record_files import utc_now
+from datagen.schemas.storage.errors import StoreUnavailable
 
 # Environment variables of a detached job: its submission id at Ray, and the address of Ray's Jobs API.
 SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"
@@ -94,7 +96,10 @@ class JobProgress:
 
 
 class JobMonitor(JobProgress):
-    """A driver's events, shown and published every `BEAT_S`; looks for requests to stop every `LOOK_S`."""
+    """A driver's events, shown and published every `BEAT_S`; looks for requests to stop every `LOOK_S`.
+
+    `check` raises InputError where the job must end; it is called as often.
+    """
 
     def __init__(
         self,
@@ -104,8 +109,10 @@ class JobMonitor(JobProgress):
         labels_per_shard: int,
         done_before: int = 0,
         notes: str = "",
+        check: Callable[[], None] = lambda: None,
     ) -> None:
         super().__init__(shown, labels_per_shard, done_before, notes)
+        self._check = check
         self._recorder, self._stop, self._clock = recorder, stop, shown.clock
         self._next_beat_s = self._next_look_s = self._clock()
 
@@ -118,6 +125,7 @@ class JobMonitor(JobProgress):
         now_s = self._clock()
         if now_s >= self._next_look_s:
             self._next_look_s = now_s + LOOK_S
+            self._check()
             self._recorder.pass_on_request(self._stop)
         if now_s >= self._next_beat_s:
             self._next_beat_s = now_s + BEAT_S
@@ -159,11 +167,16 @@ class JobRecorder:
         self._put(phase="making", labels_per_s=labels_per_s, left_s=left_s, stopping=stopping, **counts)
 
     def pass_on_request(self, stop: StopRequest) -> None:
-        """Make the request of another process, if any; one that a signal has made before counts once."""
-        with suppress(InputError):
-            if (asked := self._jobs.stop_of(self._state.id)) is not None:
-                while not (stop.force if asked == "now" else stop.drain):
-                    stop.ask()
+        """Make the request of another process, if any; one that a signal has made before counts once.
+
+        Where the store fails, no attempt of a stopped job can commit: it stops at once.
+        """
+        try:
+            asked = self._jobs.stop_of(self._state.id)
+        except InputError as error:
+            asked = "now" if stop.drain and isinstance(error, StoreUnavailable) else None
+        while asked is not None and not (stop.force if asked == "now" else stop.drain):
+            stop.ask()
 
     def seal(self) -> None:
         """Publish that the shards are made and the store is being sealed."""

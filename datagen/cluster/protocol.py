@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections import Counter
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -14,9 +15,11 @@ from typing import Literal, Protocol, TypeVar, get_args
 from datagen.cluster.code_digest import code_digest
 from datagen.schemas.run_records import Cost, Host, Layout, Outcome
 from datagen.schemas.specification import Specification
+from datagen.schemas.storage.errors import StoreUnavailable, repeated_until
 
 T_contra = TypeVar("T_contra", contravariant=True)
 End = Literal["complete", "failed", "interrupted", "aborted"]  # each worse than the one before
+_STORE_S = 15.0  # for which a stopped job waits for a store that fails
 EXIT_CODES = {"failed": 1, "aborted": 2, "interrupted": 130}  # exit codes; 0 for other ends
 
 
@@ -200,9 +203,15 @@ class StopRequest:
 
     def __init__(self) -> None:
         self._count = 0
+        self._store_until_s = float("inf")
 
     def ask(self) -> None:
         self._count += 1
+        self._store_until_s = time.monotonic() + (_STORE_S if self._count == 1 else 0.0)
+
+    def store_until_s(self) -> float:
+        """When to give up an object store that fails, by the monotonic clock."""
+        return self._store_until_s
 
     @property
     def drain(self) -> bool:
@@ -218,6 +227,8 @@ class StopRequest:
 def stop_on_signals(stop: StopRequest, interrupt: bool = False) -> Generator[StopRequest]:
     """Make Ctrl-C and SIGTERM stop requests within the block; the handlers are restored after it.
 
+    A store that fails ends a stopped block soon, with KeyboardInterrupt.
+
     With `interrupt` the second signal also raises KeyboardInterrupt, which is the only way to stop shards
     that run in this process.
     """
@@ -231,7 +242,12 @@ def stop_on_signals(stop: StopRequest, interrupt: bool = False) -> Generator[Sto
     numbers = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
     before = {number: signal.signal(number, handle) for number in numbers}
     try:
-        yield stop
+        with repeated_until(stop.store_until_s):
+            yield stop
+    except StoreUnavailable as error:
+        if stop.drain:
+            raise KeyboardInterrupt from error
+        raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.cluster.cluster_folders import private_folder
-from datagen.cluster.environment import changed_environment
+from datagen.cluster.environment import ENDING_RAY, changed_environment
 from datagen.cluster.ray_settings import (
     OBJECT_STORE_BYTES,
     head_environment,
@@ -35,7 +35,7 @@ _TOKEN_FIX = (
     "Set RAY_AUTH_TOKEN to the token that the cluster was started with, or RAY_AUTH_TOKEN_PATH to its file"
 )
 
-_START_WITHIN_S = 300.0
+_START_WITHIN_S, _END_WITHIN_S = 300.0, 20.0
 _LOOK_S = 0.05
 # Files in which the raylet expects the ports of its agents. Port 1 is never connected to.
 _AGENT_PORTS = (
@@ -106,8 +106,20 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
         start.close()
         # Private: Ray prints a paragraph for each dead worker; the driver reports it already.
         ray._private.worker._worker_logs_enabled = False  # pyright: ignore
-        whole.callback(ray.shutdown)
+        ray._private.worker._unhandled_error_handler = lambda error: None  # pyright: ignore
+        ending = threading.Thread(target=ray.shutdown, daemon=True, name=ENDING_RAY)
+        whole.callback(_end, ending, settings.tell)
         yield ray
+    if local:  # without its servers, which are killed now, Ray ends
+        ending.join(_END_WITHIN_S)
+
+
+def _end(ending: threading.Thread, tell: Callable[[str], None]) -> None:
+    """Disconnect from Ray, which would wait for ever for a server that is stopped."""
+    ending.start()
+    ending.join(_END_WITHIN_S)
+    if ending.is_alive():
+        tell(f"Ray does not disconnect within {_END_WITHIN_S:g} s: a server of its cluster does not respond")
 
 
 @contextmanager

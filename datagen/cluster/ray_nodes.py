@@ -14,8 +14,9 @@ from typing import Any
 from datagen.cluster.attempt_guard import Note, collect_post_mortem, read_note
 
 _SKIPPED_S = 30.0  # a machine that did not respond gets no request for this time
-_LOOK_S, _CONNECTS_WITHIN_S = 1.0, 2.0
-# A remote GCS server may be restarted. Without one, Ray ends this process after 60 s.
+_LOOK_S, _RESPONDS_WITHIN_S = 1.0, 2.0
+# A remote GCS server may be restarted, and a stopped one continued. Without one, Ray ends this process
+# after 60 s, or waits for ever.
 _PATIENCE_S = 20.0
 
 
@@ -29,7 +30,11 @@ class OwnNode:
     def __init__(self, ray: Any, address: str) -> None:
         # Private: the raylet's socket has no public name.
         self._node = ray._private.worker._global_node
-        self._patience_s = 0.0 if address == "local" else _PATIENCE_S
+        # A local server that refuses connections is dead; one that accepts them may be slow.
+        local = address == "local"
+        self._patience_s, self._responds_within_s = (
+            (0.0, _PATIENCE_S) if local else (_PATIENCE_S, _RESPONDS_WITHIN_S)
+        )
         self._responded_s = self._looked_s = time.monotonic()
 
     def dead(self) -> str:
@@ -45,12 +50,13 @@ class OwnNode:
         """The server that does not respond now; "" for none."""
         host, _, port = self._node.gcs_address.rpartition(":")
         try:
-            socket.create_connection((host.strip("[]"), int(port)), _CONNECTS_WITHIN_S).close()
+            with socket.create_connection((host.strip("[]"), int(port)), self._responds_within_s) as gcs:
+                gcs.recv(1)  # it speaks first; the kernel accepts connections for a stopped one
         except OSError as error:
             return f"Ray's GCS server at {host}:{port} does not respond ({error})"
         try:
             with socket.socket(socket.AF_UNIX) as raylet:
-                raylet.settimeout(_CONNECTS_WITHIN_S)
+                raylet.settimeout(_RESPONDS_WITHIN_S)
                 raylet.connect(self._node.raylet_socket_name)
         except OSError as error:
             return f"Ray's raylet on this machine does not respond ({error})"

@@ -36,6 +36,7 @@ class RunRecorder:
         )
 
     def commit_of(self, shard: int) -> Commit | None:
+        self._run.refuse_replaced()
         return self._run.commit_of(shard) if self._run.storage.exists(commit_key(shard)) else None
 
     def missing(self) -> ShardRanges:

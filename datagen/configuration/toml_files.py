@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
 
-_MAX_BYTES = 1 << 20
+_MAX_BYTES, _MAX_DOTS = 1 << 20, 200
 
 
 def read_toml(
@@ -20,7 +20,13 @@ def read_toml(
     """The content of a TOML file. InputError, with `fix`, where it is not TOML, too large or unreadable."""
     data = read_regular(path, _MAX_BYTES, fix)
     try:
-        return tomllib.loads(data.decode())
+        text = data.decode()
+        # The parser's memory grows with the square of the parts of a key.
+        if any(line.count(".") > _MAX_DOTS for line in text.splitlines()):
+            raise ValueError(f"a line has more than {_MAX_DOTS} dots")
+        content = tomllib.loads(text)
+        repr(content)  # RecursionError where it is nested too deeply for an error message
+        return content
     except (ValueError, RecursionError) as error:
         raise InputError(path, "", f"is not TOML: {error}", fix) from None
 

@@ -40,13 +40,14 @@ from datagen.display.progress import Progress
 from datagen.jobs.job_report import JobResult
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobEnd, Jobs
-from datagen.schemas.run import Run
+from datagen.schemas.run import Run, RunReplaced
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage
-from datagen.schemas.storage.errors import JOBS_WAIT_S, repeated_for_minutes
+from datagen.schemas.storage.errors import JOBS_WAIT_S, repeated_for_minutes, repeated_until
 from datagen.workers.extras import refuse_missing
 
 _TASK_MEMORY_BYTES = 2**30  # that an attempt requests of a running cluster, twice with an arm
+_RECORDED_WITHIN_S = 5.0  # the end of a job that an error has ended, perhaps of the store
 _DETACH = (
     "Run as a Ray job that continues after this shell ends: on the cluster of --address, its dashboard "
     "http://HOST:8265, else on a Ray head of this machine."
@@ -140,8 +141,10 @@ class Job:
             result = self._finish(summary)
         except BaseException as error:
             end, code = _end_of(error)
-            recorder.end(end, code, " ".join(str(error).split())[:1000])
-            if isinstance(error, InputError) and not isinstance(error, _CannotContinue):
+            until_s = time.monotonic() + (0.0 if end == "interrupted" else _RECORDED_WITHIN_S)
+            with repeated_until(lambda: until_s):
+                recorder.end(end, code, " ".join(str(error).split())[:1000])
+            if isinstance(error, InputError) and not isinstance(error, _CannotContinue | RunReplaced):
                 fix = f"{error.fix}. Then resume: {command_line(self.resume)}"
                 raise InputError(error.place, error.field, error.problem, fix) from error
             raise
@@ -205,13 +208,13 @@ class Job:
 
         shown.phase("making labels")
         done = len(run.planned()) - len(shards)
-        events = JobMonitor(recorder, stop, shown, layout.samples_per_shard, done, notes)
+        events = JobMonitor(recorder, stop, shown, layout.samples_per_shard, done, notes, run.refuse_replaced)
         policy = self.policy
         if run.storage.folder is None:  # attempts that wait for the store are not hung
             policy = replace(policy, min_deadline_s=policy.min_deadline_s + JOBS_WAIT_S)
         waiting = "waiting for the object store: "
         tell_trouble = repeated_for_minutes(lambda error: _tell(shown, "store", waiting + error.problem))
-        with probe_in(run) as probe, tell_trouble:
+        with tell_trouble, probe_in(run) as probe:
             return drive(shards, make_task, executor, RunRecorder(run), policy, events, stop)
 
     def _executor(self, shards: int, stack: ExitStack, shown: Progress) -> Executor[ShardTask]:
@@ -237,6 +240,8 @@ class Job:
 
         The driver knows only its own shards, which may be the last two of a thousand.
         """
+        for job_run in self.runs:
+            job_run.run.refuse_replaced()
         if summary.end not in ("complete", "failed") or summary.remaining:
             return summary
         quarantined = planned = 0

@@ -109,7 +109,9 @@ class Jobs:
             raise InputError(where, "", "exists already", "Start the job again: it gets another name")
 
     def put_state(self, state: JobState) -> None:
-        self._storage.put(f"jobs/{state.id}.state.json", encode_record(state), durably=False)
+        """Publish a state, unless the job's record is gone, as with a run that another one has replaced."""
+        if self._storage.exists(f"jobs/{state.id}.json"):
+            self._storage.put(f"jobs/{state.id}.state.json", encode_record(state), durably=False)
 
     def ask_to_stop(self, job: str, at_once: bool) -> None:
         """Ask a job to stop. A request to stop at once is not replaced by a weaker one."""

@@ -10,7 +10,7 @@ import json
 import platform
 import re
 import secrets
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from hashlib import sha256
 from typing import Any, TypeVar
@@ -173,14 +173,16 @@ LOST_CAUSE = "it left no record, and its shard was decided without it"
 class Ledger:
     """The start of every attempt, and the end of those that did not commit, under `ledger/` of a run.
 
-    A commit is the end of its attempt: it has outcome, cost and machine.
+    A commit is the end of its attempt: it has outcome, cost and machine. `check` raises InputError where
+    nothing may be written.
     """
 
-    def __init__(self, storage: Storage) -> None:
-        self._storage = storage
+    def __init__(self, storage: Storage, check: Callable[[], None] = lambda: None) -> None:
+        self._storage, self._check = storage, check
 
     def start(self, attempt: str, shard: int) -> None:
         """Record that an attempt begins. InputError for two attempts of one name, which is a defect."""
+        self._check()
         record = AttemptStart(
             attempt=attempt, shard=shard, started=utc_now(), host=platform.node(), writer=secrets.token_hex(8)
         )
@@ -194,6 +196,7 @@ class Ledger:
         The end of an attempt that another job recorded as lost replaces that guess. Where the start record is
         missing, it is written here, so that every end has one.
         """
+        self._check()
         if entry.outcome != "superseded" and not self._storage.exists(start_key(entry.attempt)):
             self._storage.put_new(start_key(entry.attempt), encode_record(start_from_end(entry)))
         kept = entry.model_copy(

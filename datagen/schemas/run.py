@@ -60,6 +60,10 @@ class Rows(NamedTuple):
     samples: int
 
 
+class RunReplaced(InputError):
+    """Another run has taken the folder of one that was opened, or it is gone."""
+
+
 class Run:
     """One run. Cheap to open and to send to another process; holds no lock.
 
@@ -71,7 +75,7 @@ class Run:
         self.storage = storage
         self.manifest = manifest
         self.scenes = scenes
-        self.ledger = Ledger(storage)
+        self.ledger = Ledger(storage, self.refuse_replaced)
 
     def __repr__(self) -> str:
         return f"Run({self.storage.url!r})"
@@ -111,6 +115,15 @@ class Run:
             problem = "is not the hash of the specification in the record"
             raise InputError(where, "spec_hash", problem, "The manifest was edited: restore it from a copy")
         return cls(storage, manifest, scenes)
+
+    def refuse_replaced(self) -> None:
+        """Raise RunReplaced where this is no longer the run that was opened: before anything is written."""
+        stored = read_record(self.storage, "manifest.json", Manifest)
+        if stored != self.manifest:
+            ours, now = (m and f"run {m.spec_hash[:12]} of {m.created}" for m in (self.manifest, stored))
+            problem = f"this job makes {ours}, but the folder now has {now or 'none'}"
+            fix = "Give each run its own --out; if ours was moved, resume it there"
+            raise RunReplaced(f"{self.storage.url}/manifest.json", "", problem, fix)
 
     @property
     def layout(self) -> Layout:
@@ -217,6 +230,7 @@ class Run:
             problem = f"has {len(data):,} bytes, more than 2 GiB"
             fix = "Give fewer --candidates-per-scene, or fewer observation.n_points in --config"
             raise InputError(f"shard of attempt {attempt}", "", problem, fix)
+        self.refuse_replaced()
         if not self.storage.put_new(object_key(attempt), data):
             place = f"{self.storage.url}/{object_key(attempt)}"
             raise InputError(place, "", "exists already", "Give every attempt its own name")
@@ -242,6 +256,7 @@ class Run:
 
     def close_lost_attempts(self, ended: str = "") -> int:
         """End attempts without an end, as lost, whose shard is decided without them; return their number."""
+        self.refuse_replaced()
         committed = {commit.attempt: commit.shard for commit in self.commits()}
         decided = set(committed.values()) | self.quarantined()
         lost = [start for start in self.ledger.unfinished(committed) if start.shard in decided]
@@ -253,6 +268,7 @@ class Run:
 
     def quarantine(self, record: QuarantineRecord) -> bool:
         """Quarantine a shard; False where it already was."""
+        self.refuse_replaced()
         cut = tuple(stack[-MAX_STACK_CHARS:] for stack in record.stacks)
         kept = record.model_copy(update={"stacks": cut})
         return self.storage.put_new(f"quarantine/{record.shard:06d}.json", encode_record(kept))

@@ -113,3 +113,11 @@ def test_a_bad_statement_is_named(text: str, tmp_path: Path, capsys: pytest.Capt
     arguments = submitted(tmp_path)
     (tmp_path / "houses/source.json").write_text(text)
     refused(arguments, capsys, "houses/source.json")
+
+
+def test_a_statement_that_links_to_nothing_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = submitted(tmp_path)
+    (tmp_path / "houses/source.json").symlink_to(tmp_path / "gone.json")
+    refused(arguments, capsys, "houses/source.json")

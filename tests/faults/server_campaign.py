@@ -24,14 +24,16 @@ from tests.faults.job import RandomRows, make_rows
 from tests.made_runs import make_run
 
 POLICY = RetryPolicy(backoff_s=0.05)
+STOPPED = "stopped "
 
 
 def kill_server(ray: Any, kind: str) -> bool:
-    """SIGKILL to the `raylet` or the `gcs_server` of this process's local cluster; whether it lived."""
-    (server,) = ray._private.worker._global_node.all_processes[kind]
+    """SIGKILL, or SIGSTOP with `stopped `, to a server of this process's cluster; whether it lived."""
+    (server,) = ray._private.worker._global_node.all_processes[kind.removeprefix(STOPPED)]
     if server.process.poll() is not None:
         return False
-    psutil.Process(server.process.pid).kill()
+    process = psutil.Process(server.process.pid)
+    process.suspend() if kind.startswith(STOPPED) else process.kill()
     return True
 
 

@@ -107,6 +107,24 @@ def repeated_for_minutes(told: Callable[[StoreUnavailable], None] = lambda error
         _told.remove(told)
 
 
+_last_s: list[Callable[[], float]] = []
+
+
+@contextmanager
+def repeated_until(end_s: Callable[[], float]) -> Generator[None]:
+    """Within the block, no request is repeated after `end_s()` by the monotonic clock, in any thread."""
+    _last_s.append(end_s)
+    try:
+        yield
+    finally:
+        _last_s.remove(end_s)
+
+
+def last_repetition_s() -> float:
+    """When this process repeats no request any more, by the monotonic clock."""
+    return min((end_s() for end_s in _last_s), default=float("inf"))
+
+
 def tell_repetition(error: StoreUnavailable) -> None:
     """Report a request that fails for some seconds, and is repeated."""
     for told in list(_told):

@@ -1,7 +1,8 @@
 """Objects below a prefix of an S3 bucket, through obstore, with bounded retries.
 
 The client's own retries are off, so that one rule holds for every request: transient failures are retried
-with growing pauses until `PATIENCE` timeouts have passed, in a job for minutes. Others are raised at once.
+with growing pauses until `PATIENCE` timeouts have passed, in a job for minutes or until it is
+stopped. Others are raised at once.
 """
 
 from __future__ import annotations
@@ -21,7 +22,14 @@ from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import S3Store
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.storage.errors import RequestFailure, store_trouble, tell_repetition, too_large, waits_s
+from datagen.schemas.storage.errors import (
+    RequestFailure,
+    last_repetition_s,
+    store_trouble,
+    tell_repetition,
+    too_large,
+    waits_s,
+)
 from datagen.schemas.storage.local_files import StoredFile
 
 TIMEOUT_S = 20.0  # seconds without a response after which a request fails
@@ -225,7 +233,8 @@ class RemoteObjects:
                 tries += 1
                 error = trouble.at(f"{self.url}/{key}" if key else self.url)
                 end_s = start_s + max(PATIENCE * self._timeout_s, waits_s())
-                if not trouble.is_transient or (tries > 1 and time.monotonic() + pause_s > end_s):
+                is_last = tries > 1 and time.monotonic() + pause_s > end_s
+                if not trouble.is_transient or is_last or time.monotonic() > last_repetition_s():
                     raise error from e
                 if tries == _TOLD_AFTER:
                     tell_repetition(error)

@@ -112,6 +112,15 @@ def test_what_is_wrong_is_refused_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("ranges", [False, True])
+def test_a_file_shorter_than_stated_is_given_up(site: Site, tmp_path: Path, ranges: bool) -> None:
+    """The server does not tell its length, so each end of it may be a broken connection."""
+    site.hide_length, site.ranges = True, ranges
+    with pytest.raises(InputError, match="gave up after 4 tries"):
+        _get(site, tmp_path / "a", size=len(BODY) + 1)
+    assert not (tmp_path / "a").exists() and len(site.requests) < 10
+
+
 def test_no_file_and_redirects_out_of_http_are_refused(site: Site, tmp_path: Path) -> None:
     site.files.clear()
     with pytest.raises(InputError, match=site.url):

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from datagen.configuration.specify import specify
+from datagen.schemas.errors import InputError
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
 
@@ -50,3 +51,15 @@ def test_scenes_with_a_required_set_have_a_version_of_their_own() -> None:
         for within in (None, "clear", "in-range")
     ]
     assert versions == ["1", "2", "2"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a." * 50_000 + "a = 1", "[" + "scene." * 50_000 + "a]", "a = " + "{a.a.a.a.a = " * 90 + "1" + "}" * 90],
+)
+def test_deeply_nested_configurations_are_refused(text: str, tmp_path: Path) -> None:
+    """The parser needs gigabytes for such keys, and messages cannot show what it reads."""
+    config = tmp_path / "run.toml"
+    config.write_text(text)
+    with pytest.raises(InputError, match=r"run\.toml: is not TOML"):
+        specify("heuristic", open_houses("builtin"), open_objects("builtin"), {}, config)

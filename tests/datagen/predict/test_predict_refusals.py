@@ -1,149 +1,22 @@
-"""`datagen predict` as a user meets it: what it writes, and what it refuses in one line."""
+"""What `datagen predict` refuses, each in one line: files, options, and frames without depth."""
 
 from __future__ import annotations
 
 import io
 import json
 import os
-import re
 import struct
-import sys
 import zipfile
 import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
-import safetensors.torch
-import torch
 from PIL import Image
 
-from datagen import cli
+from tests.datagen.predict.frames import arguments, frame_with, pictures
 from tests.refusals import refused
-from tests.small_runs import files_of, json_of
-from tests.train.prediction.checkpoints import stored_with, write_untrained
-from tests.train.prediction.seen_scenes import MODEL, draw_seen, write_frame
-
-HEIGHT_M = 0.8197  # the scene's camera above the floor
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a frame without and with its pose, and a checkpoint. Tests only read it."""
-    folder = tmp_path_factory.mktemp("predict")
-    seen = draw_seen(0)
-    assert seen.height_m == pytest.approx(HEIGHT_M, abs=0.01)
-    write_frame(folder / "frame", seen, posed=False)
-    write_frame(folder / "posed", seen)
-    write_untrained(folder / "model.ckpt", MODEL)
-    return folder
-
-
-def arguments(folder: Path, *more: str, drop: tuple[str, ...] = ()) -> list[str]:
-    """A whole command line, with options left out, replaced or added."""
-    chosen = {
-        "--frame": str(folder / "frame"),
-        "--camera-height": str(HEIGHT_M),
-        "--base-height": "0.7",
-        "--reach": "0.9",
-    }
-    chosen |= dict(zip(more[::2], more[1::2], strict=True))
-    pairs = [text for name, value in chosen.items() if name not in drop for text in (name, value)]
-    return ["predict", str(folder / "model.ckpt"), *pairs]
-
-
-def frame_with(source: Path, folder: Path, **files: Path | np.ndarray | None) -> str:
-    """A copy of a frame in which files are replaced, by name before the dot, or left out."""
-    frame = folder / "changed"
-    frame.mkdir()
-    for path in source.iterdir():
-        if path.stem not in files:
-            (frame / path.name).symlink_to(path)
-    endings = {"intrinsics": ".json", "pose": ".json"}
-    for name, content in files.items():
-        if isinstance(content, np.ndarray):
-            Image.fromarray(content).save(frame / f"{name}.png")
-        elif content is not None:
-            (frame / f"{name}{endings.get(name, '.png')}").symlink_to(content)
-    return str(frame)
-
-
-def test_an_answer_as_json_picture_and_page(
-    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out, page = tmp_path / "a.png", tmp_path / "a.html"
-    answer = json_of(capsys, arguments(made, "--out", str(out), "--html", str(page)))
-    assert len(answer["candidates"]) == 625 and answer["best"]["state"] == "clear"
-    scores = [c["score"] for c in answer["candidates"] if c["state"] == "clear"]
-    assert answer["best"]["score"] == max(scores)
-    T = np.array(answer["T_world_camera"][0]) @ answer["best"]["T_camera_base"]
-    np.testing.assert_allclose(T, answer["best"]["T_world_base"], atol=1e-9)
-    assert T[2, 3] == pytest.approx(0.7)
-    assert "ahead" in answer["world"] and answer["floor"]["residual_m"] < 0.02
-    with Image.open(out) as image:
-        pixels = np.asarray(image.convert("RGB")).astype(np.int64)
-    assert (np.abs(pixels - (255, 196, 0)).max(axis=2) < 8).sum() > 200  # the gold pose
-    text = page.read_text()
-    for words in ('<html lang="en">', 'name="viewport"', "<title>Base poses scored by", "color-scheme: dark"):
-        assert words in text
-    # The view begins behind the camera, which is at y = 0 and looks ahead along y.
-    eye = re.search(r'"eye":\{"x":([-.\d]+),"y":([-.\d]+)', text)
-    assert eye is not None and abs(float(eye[1])) < 0.5 and float(eye[2]) < -2
-    assert "Plotly.newPlot" in text and "score 0." in text and 'src="http' not in text
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.html", "a.png"]
-
-
-def test_a_click_and_the_same_frame_as_folder_archive_and_cloud(
-    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    frame = made / "posed"
-    pose = json.loads((frame / "pose.json").read_text())["T_world_camera"]
-    mask = np.asarray(Image.open(frame / "mask.png")) > 0
-    depth = np.asarray(Image.open(frame / "depth.png"))
-    rgb = np.asarray(Image.open(frame / "color.png"))
-    numbers = json.loads((frame / "intrinsics.json").read_text())
-    four = np.array([numbers[k] for k in ("fx", "fy", "ppx", "ppy")])
-    np.savez(tmp_path / "a.npz", rgb=rgb, depth=depth, mask=mask, intrinsics=four, T_world_camera=pose)
-    v, u = np.nonzero(depth)
-    z = depth[v, u] / 1000
-    xyz = np.stack([(u - four[2]) / four[0] * z, (v - four[3]) / four[1] * z, z], axis=1)
-    rows = np.zeros(len(z), [("p", "<f4", 3), ("c", "u1", 3), ("target", "u1")])
-    rows["p"], rows["c"], rows["target"] = xyz, rgb[v, u], mask[v, u]
-    names = [*(f"float {a}" for a in "xyz"), *(f"uchar {c}" for c in ("red", "green", "blue", "target"))]
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(z)}"]
-    head += [f"property {name}" for name in names] + ["element face 0", "end_header", ""]
-    (tmp_path / "a.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
-
-    rest = ["--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2"]
-    # Without hand poses, whose clearances are in cells, so that rounded depths could change them by one.
-    checkpoint = str(tmp_path / "model.ckpt")
-    write_untrained(tmp_path / "model.ckpt", MODEL | {"hand_poses": 0})
-    x, y, z = (-np.array(pose)[2, :3]).tolist()
-    level = ["--gravity", f"{x},{y},{z}", "--camera-height", str(pose[2][3])]
-    answers = {
-        "folder": ["--frame", str(frame)],
-        "npz": ["--frame", str(tmp_path / "a.npz")],
-        "ply": ["--frame", str(tmp_path / "a.ply"), *level],
-        "click": ["--frame", frame_with(frame, tmp_path, mask=None)],
-    }
-    middle = np.argmin((v - np.nonzero(mask)[0].mean()) ** 2 + (u - np.nonzero(mask)[1].mean()) ** 2)
-    answers["click"] += ["--click", f"{u[middle]},{v[middle]}"]
-    found = {name: json_of(capsys, ["predict", checkpoint, *given, *rest]) for name, given in answers.items()}
-    whole, cloud = found["folder"], found.pop("ply")
-    assert cloud["target"]["center_m"][2] == pytest.approx(whole["target"]["center_m"][2], abs=1e-5)
-    for name, answer in found.items():
-        gap = np.subtract(answer["target"]["center_m"], whole["target"]["center_m"])
-        assert np.linalg.norm(gap) < (0.01 if name == "click" else 1e-5), name
-    ours, theirs = ([c["score"] for c in a["candidates"]] for a in (found["npz"], whole))
-    np.testing.assert_allclose(ours, theirs, atol=1e-4)
-    assert np.ptp(theirs) > 0.1
-    assert found["click"]["target"]["mask_pixels"] == pytest.approx(mask.sum(), rel=0.15)
-
-
-def test_a_frame_without_a_clear_place_ends_with_1(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(arguments(made, "--footprint", "2")) == 1
-    told = capsys.readouterr().out
-    assert "no answer" in told and "0 clear" in told
+from tests.small_runs import files_of
 
 
 def chunk(kind: bytes, data: bytes) -> bytes:
@@ -338,12 +211,6 @@ def test_a_click_that_hits_nothing(
     refused(arguments(made, "--frame", frame, "--click", click), capsys, "--click", words)
 
 
-def pictures(made: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Depth and mask of the frame, to be changed."""
-    depth, mask = (np.array(Image.open(made / "frame" / f"{name}.png")) for name in ("depth", "mask"))
-    return depth, mask > 0
-
-
 def test_a_target_without_depth_is_refused(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -365,44 +232,3 @@ def test_a_floor_out_of_sight_is_asked_for(
     depth[height < 0.3] = 0
     frame = frame_with(made / "frame", tmp_path, depth=depth)
     refused(arguments(made, "--frame", frame), capsys, "floor", "--gravity")
-
-
-@pytest.mark.parametrize("json_too", [False, True])
-@pytest.mark.parametrize(
-    ("value", "words"), [(np.nan, "NaN or infinite"), (3e38, "is not finite for sample")]
-)
-def test_a_model_without_finite_scores_gives_no_answer(
-    made: Path, tmp_path: Path, value: float, words: str, json_too: bool, capsys: pytest.CaptureFixture[str]
-) -> None:
-    whole = safetensors.torch.load_file(made / "model.ckpt")
-    filled = {name: torch.full_like(tensor, value) for name, tensor in whole.items()}
-    stored_with(tmp_path / "bad.ckpt", made / "model.ckpt", filled)
-    given = arguments(made)
-    given[1] = str(tmp_path / "bad.ckpt")
-    assert cli.run([*given, *(["--json"] if json_too else [])]) == 2
-    told = capsys.readouterr()
-    assert told.out == "" and words in told.err and told.err.count("\n") == 1
-
-
-def test_a_page_without_plotly_is_refused_before_anything_is_written(
-    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "plotly", None)
-    monkeypatch.delitem(sys.modules, "datagen.train.prediction.page", raising=False)
-    written = ("--html", str(tmp_path / "page.html"), "--out", str(tmp_path / "a.png"))
-    refused(arguments(made, *written), capsys, "plotly: is not installed. Install the extra train: pip")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("z", [0.0, 1.0])
-def test_a_cloud_of_equal_points(
-    z: float, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """It has an answer or an error, and no traceback: a point was drawn more than once into the sample."""
-    n, target = 4000, "property uchar target\n"
-    axes = "".join(f"property float {axis}\n" for axis in "xyz")
-    head = f"ply\nformat ascii 1.0\nelement vertex {n}\n{axes}{target}end_header\n"
-    (tmp_path / "equal.ply").write_text(head + f"0.5 0.2 {z} 1\n" * n)
-    given = arguments(made, "--frame", str(tmp_path / "equal.ply"), "--gravity", "0,1,0")
-    assert cli.run(given) in (0, 1, 2)
-    assert "Traceback" not in capsys.readouterr().err
