@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from datagen.schemas.errors import InputError, printable
 from datagen.workers.foreign_files import START_BYTES, refuse_other_kind
@@ -18,8 +17,7 @@ _LONGEST_TEXT = 500
 _MOST_PARTS = 4_000_000
 
 
-@dataclass(frozen=True)
-class JsonNode:
+class JsonNode(NamedTuple):
     """A JSON value; `place` is the file (and line), `path` its location in the document."""
 
     place: str

@@ -35,11 +35,12 @@ class Obstacles:
 
 def obstacles_of(house: House) -> Obstacles:
     """Footprints of every convex part of the house that rises above the floor."""
-    parts = [p for body in house.bodies for p in body.convex_parts_m if p[:, 2].max() > STEP_M]
+    low_m, high_m = (corners_m[:, 2] for corners_m in house.part_boxes_m)
+    rows = np.flatnonzero(high_m > STEP_M)
     return Obstacles(
-        polygons_m=stack_polygons([convex_hull(p[:, :2].astype(np.float64)) for p in parts]),
-        low_m=np.array([p[:, 2].min() for p in parts], np.float64),
-        high_m=np.array([p[:, 2].max() for p in parts], np.float64),
+        polygons_m=stack_polygons([convex_hull(house.parts_m[k][:, :2]) for k in rows]),
+        low_m=low_m[rows].astype(np.float64),
+        high_m=high_m[rows].astype(np.float64),
         floors_m=tuple(room.polygon_m for room in house.rooms),
     )
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, Protocol
+
+import numpy as np
 
 from datagen.workers.geometry.mesh import F32, F64, Mesh
 
@@ -67,6 +70,19 @@ class House:
     surfaces: tuple[Surface, ...]
     # Things that are left out or implausible, counted by cause.
     findings: Mapping[str, int] = field(default_factory=dict)
+
+    @cached_property
+    def parts_m(self) -> list[F32]:
+        """The convex parts of all bodies, each (V, 3)."""
+        return [part for body in self.bodies for part in body.convex_parts_m]
+
+    @cached_property
+    def part_boxes_m(self) -> tuple[F32, F32]:
+        """Lowest and highest corners (P, 3) of the bounding boxes of `parts_m`."""
+        points_m = np.concatenate([np.empty((0, 3), np.float32), *self.parts_m])
+        ends = np.cumsum([len(part) for part in self.parts_m], dtype=np.int64)
+        starts = np.concatenate([[0], ends])[:-1]
+        return np.minimum.reduceat(points_m, starts), np.maximum.reduceat(points_m, starts)
 
     def room(self, room_id: str) -> Room:
         return next(r for r in self.rooms if r.room_id == room_id)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from itertools import product
 
 import numpy as np
 
 from datagen.workers.furniture.assets import CARRYING_TYPES, top_rectangles
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.geometry.planar import inside_polygon
+from datagen.workers.geometry.planar import following, inside_polygon
 from datagen.workers.houses.house import Room
 from datagen.workers.houses.things import Thing
 from datagen.workers.json_document import JsonNode
@@ -24,6 +25,7 @@ _OFF_FLOOR_M = 0.05
 _OFF_SUPPORT_M = 0.12
 _BEYOND_ROOM_M = 0.3
 _OVERLAP_M = 0.1
+_UNIT_BOX = np.array(list(product((-1.0, 1.0), (-1.0, 1.0), (0.0, 1.0))))
 # Furniture that may hang on a wall, and seats that are pushed below tables.
 _HUNG = frozenset({"Cabinet", "Shelf", "ShelvingUnit"})
 _PUSHED_IN = frozenset({"Chair", "Footstool", "Ottoman", "Stool"})
@@ -36,9 +38,10 @@ def refuse_implausible(
 
     Raises InputError beyond MOST_IMPLAUSIBLE.
     """
-    furniture = [(thing, _corners(thing)) for thing in things if thing.kind == "furniture"]
-    found = Counter(cause for thing in things if (cause := _off_support(thing)))
-    found[_OUTSIDE] = sum(_is_outside(corners_m, thing.room_xy, rooms) for thing, corners_m in furniture)
+    boxes = list(zip(things, _corners(things), strict=True))
+    furniture = [(thing, corners_m) for thing, corners_m in boxes if thing.kind == "furniture"]
+    found = Counter(cause for thing, corners_m in boxes if (cause := _off_support(thing, corners_m)))
+    found[_OUTSIDE] = _outside(furniture, rooms)
     found[_OVERLAPPING] = _overlapping(furniture)
     findings.update(+found)
     found[NO_WALL] = findings[NO_WALL]
@@ -49,9 +52,9 @@ def refuse_implausible(
         raise root.error(problem, "Check units, axes and the point that positions name, or remove the house.")
 
 
-def _off_support(thing: Thing) -> str:
+def _off_support(thing: Thing, corners_m: F64) -> str:
     """The cause if the thing is neither on the floor, nor on its support, nor hung up; else ""."""
-    lowest_m = float(_corners(thing)[:, 2].min())
+    lowest_m = float(corners_m[:, 2].min())
     if thing.kind == "furniture":
         stands = thing.is_upright and thing.asset.object_type in CARRYING_TYPES - _HUNG
         above_m = lowest_m - _OFF_FLOOR_M if stands else 0.0
@@ -60,23 +63,28 @@ def _off_support(thing: Thing) -> str:
     return _SUNK if lowest_m < -_OFF_FLOOR_M else _FLOATING if above_m > 0 else ""
 
 
-def _corners(thing: Thing) -> F64:
-    """Corners (8, 3) of the asset's box, world."""
-    x, y, height = thing.asset.halves_m
-    box = np.array([[sx * x, sy * y, z] for sx in (-1, 1) for sy in (-1, 1) for z in (0.0, height)])
-    return box @ thing.T_world_asset[:3, :3].T + thing.T_world_asset[:3, 3]
+def _corners(things: list[Thing]) -> F64:
+    """Corners (N, 8, 3) of the assets' boxes, world."""
+    sizes_m = np.array([thing.asset.halves_m for thing in things]).reshape(-1, 1, 3)
+    T = np.array([thing.T_world_asset for thing in things]).reshape(-1, 4, 4)
+    return (_UNIT_BOX * sizes_m) @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
 
 
-def _is_outside(corners_m: F64, centre_m: F64, rooms: list[Room]) -> bool:
-    """Whether a box reaches far out of the room that holds its centre, or no room does."""
-    polygon = next((r.polygon_m for r in rooms if inside_polygon(centre_m[None], r.polygon_m)[0]), None)
-    if polygon is None:
-        return True
-    points = corners_m[~inside_polygon(corners_m[:, :2], polygon), :2]
-    along = np.roll(polygon, -1, axis=0) - polygon  # (K, 2)
-    t = ((points[:, None] - polygon) * along).sum(2) / (along**2).sum(1)
-    nearest = polygon + np.clip(t, 0.0, 1.0)[..., None] * along
-    return bool((np.linalg.norm(points[:, None] - nearest, axis=2).min(1) > _BEYOND_ROOM_M).any())
+def _outside(furniture: list[tuple[Thing, F64]], rooms: list[Room]) -> int:
+    """Pieces that reach far out of the first room that holds their centre, or have none."""
+    centres_m = np.array([thing.room_xy for thing, _ in furniture]).reshape(-1, 2)
+    corners_m = np.array([corners_m[:, :2] for _, corners_m in furniture]).reshape(-1, 8, 2)
+    homeless, outside = np.ones(len(furniture), np.bool_), 0
+    for polygon in (room.polygon_m for room in rooms):
+        own = homeless & inside_polygon(centres_m, polygon)
+        homeless &= ~own
+        points = corners_m[own].reshape(-1, 2)
+        along = following(polygon) - polygon  # (K, 2)
+        t = ((points[:, None] - polygon) * along).sum(2) / (along**2).sum(1)
+        nearest = polygon + np.clip(t, 0.0, 1.0)[..., None] * along
+        beyond = np.linalg.norm(points[:, None] - nearest, axis=2).min(1) > _BEYOND_ROOM_M
+        outside += int((beyond & ~inside_polygon(points, polygon)).reshape(-1, 8).any(1).sum())
+    return outside + int(homeless.sum())
 
 
 def _overlapping(furniture: list[tuple[Thing, F64]]) -> int:

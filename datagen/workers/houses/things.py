@@ -95,12 +95,12 @@ def _pose(node: JsonNode, asset: Asset) -> tuple[F64, float]:
     x, y, z = node.get("position").point()
     turn = node.get("rotation")
     pitch, yaw, roll = (turn.get(k).number(-_MAX_ANGLE_DEG, _MAX_ANGLE_DEG) for k in "xyz")
-    upright = _upright_rotation(yaw + 0.0)  # adding makes -0.0 the key of 0.0
-    rotation = upright if pitch == roll == 0 else unity_rotation(pitch, yaw, roll)
-    tilt_deg = float(np.degrees(np.arccos(np.clip(rotation[2, 2], -1.0, 1.0))))
+    rotation, tilt_deg = _upright_rotation(yaw + 0.0), 0.0  # adding makes -0.0 the key of 0.0
+    if not pitch == roll == 0:
+        tilted = unity_rotation(pitch, yaw, roll)
+        tilt_deg = float(np.degrees(np.arccos(np.clip(tilted[2, 2], -1.0, 1.0))))
+        rotation = rotation if tilt_deg <= _UPRIGHT_DEG else tilted
     T = np.eye(4)
-    if tilt_deg <= _UPRIGHT_DEG:
-        rotation = upright
     T[:3, :3] = rotation
     T[:3, 3] = np.array([x, z, y]) - rotation @ (0.0, 0.0, asset.size_m[2] / 2)
     return T, tilt_deg

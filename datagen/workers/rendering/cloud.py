@@ -61,7 +61,7 @@ def observe_cloud(
     a farthest-point sample.
     """
     window = rng.permutation(target_pixels(camera, centre_m, radius_m))
-    order = rng.permutation(np.arange(camera.width_px * camera.height_px, dtype=np.int32))
+    order = rng.permutation(camera.width_px * camera.height_px)
     found = cast(window)
     sure = window[found.body == target_body][: params.min_target_points]
     fresh = np.ones(len(order), np.bool_)

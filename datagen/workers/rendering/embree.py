@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import HalfspaceIntersection
 
 from datagen.workers.geometry.mesh import F32, F64, I32, U8, Mesh, concatenate, face_normals
 from datagen.workers.houses.house import House
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
     from embreex.rtcore_scene import EmbreeScene
 
 MISS = np.float32(1e37)  # Embree's parameter of a ray that hit nothing
+_APART_M = 1e-4  # of a polyhedron from its mesh, which may be flat
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +36,15 @@ class RayMesh:
     mesh: Mesh
     hierarchy: EmbreeScene
     normals: F32  # (F, 3), unit, mesh frame
-    box_corners_m: F32  # (8, 3), of the bounding box, mesh frame
+
+    @cached_property
+    def around_m(self) -> F64:
+        """Corners (K, 3), mesh frame, of a convex polyhedron of at most 26 faces that holds the mesh."""
+        axes = np.array([axis for axis in product((-1.0, 0.0, 1.0), repeat=3) if any(axis)])
+        points_m = self.mesh.vertices_m.astype(np.float64)
+        reach_m = (points_m @ axes.T).max(0) + _APART_M
+        centre_m = (points_m.min(0) + points_m.max(0)) / 2
+        return HalfspaceIntersection(np.column_stack([axes, -reach_m]), centre_m).intersections
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +70,7 @@ def ray_mesh(mesh: Mesh) -> RayMesh:
         np.ascontiguousarray(mesh.faces, np.int32),
     )
     normals = face_normals(mesh.vertices_m[mesh.faces])
-    low, high = mesh.vertices_m.min(0), mesh.vertices_m.max(0)
-    corners_m = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(8, 3)
-    rays = RayMesh(mesh, hierarchy, normals.astype(np.float32), corners_m)
+    rays = RayMesh(mesh, hierarchy, normals.astype(np.float32))
     # Embree builds on the first query; doing it here keeps that cost out of the stages that time rays.
     nearest(rays, np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
     return rays

@@ -14,8 +14,12 @@ from datagen.workers.rendering.embree import MISS, RayMesh, RayScene, nearest, o
 _SKIN_M = 5e-4
 # Rays in flight at once; bounds memory at about 25 MB. Far more rays do not fit the cache.
 _MAX_RAYS = 1 << 16
+# Directions in which the image of the target is bounded, and what is added to it against rounding.
+_SLOPES = (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0)
+_SLACK = 1e-3
 
 I32 = npt.NDArray[np.int32]
+Counts = npt.NDArray[np.int64]
 
 
 def visible_pixels(scene: RayScene, target: int, eyes_m: F64, window: int) -> tuple[I32, I32]:
@@ -41,75 +45,84 @@ def visible_pixels(scene: RayScene, target: int, eyes_m: F64, window: int) -> tu
 def _count(scene: RayScene, target: int, eyes_m: F64, distance_m: F64, window: int) -> tuple[I32, I32]:
     n = len(eyes_m)
     T_world_target = scene.T_world_object[target]
-    axes = np.stack([look_at(eye, T_world_target[:3, 3])[:3, :3] for eye in eyes_m])  # (n, 3, 3)
+    axes = look_at(eyes_m, T_world_target[:3, 3])[:, :3, :3]
     sine = scene.radii_m[target] / distance_m
     half_width = sine / np.sqrt(1 - sine**2)  # half of the window at depth 1
-    eye, x, y = _window_rays(scene.objects[target], T_world_target, eyes_m, axes, half_width, window)
+    per_eye, x, y = _window_rays(scene.objects[target], T_world_target, eyes_m, axes, half_width, window)
 
     # Alone, in the target's own frame.
     local_axes = T_world_target[:3, :3].T @ axes
     local_eyes = ((eyes_m - T_world_target[:3, 3]) @ T_world_target[:3, :3]).astype(np.float32)
-    parameter = nearest(
-        scene.objects[target], local_eyes.take(eye, axis=0), _directions(local_axes, eye, x, y)
-    )
+    towards = _directions(local_axes, per_eye, x, y)
+    parameter = nearest(scene.objects[target], _repeated(local_eyes, per_eye), towards)
     hit = np.flatnonzero(parameter < MISS)
-    eye, limits = eye[hit], parameter[hit] - np.float32(_SKIN_M)
-    directions = _directions(axes, eye, x[hit], y[hit])
-    alone = np.bincount(eye, minlength=n).astype(np.int32)
+    eye, limits = np.repeat(np.arange(n), per_eye)[hit], parameter[hit] - np.float32(_SKIN_M)
+    alone = np.bincount(eye, minlength=n)
+    directions = _directions(axes, alone, x[hit], y[hit])
 
     # The rays that neither the house nor another object in front of the target blocks.
-    free = ~occluded(scene.house, eyes_m.astype(np.float32).take(eye, axis=0), directions, limits)
+    free = ~occluded(scene.house, _repeated(eyes_m.astype(np.float32), alone), directions, limits)
     for k in range(len(scene.objects)):
         if k == target:
             continue
-        between = np.flatnonzero(_may_hide(scene, k, target, eyes_m, distance_m)[eye] & free)
+        between = np.flatnonzero(np.repeat(_may_hide(scene, k, target, eyes_m, distance_m), alone) & free)
         if len(between):
             T = scene.T_world_object[k]
             local = ((eyes_m - T[:3, 3]) @ T[:3, :3]).astype(np.float32)
             towards = directions.take(between, axis=0) @ T[:3, :3].astype(np.float32)
-            origins_m = local.take(eye.take(between), axis=0)
+            origins_m = _repeated(local, np.bincount(eye[between], minlength=n))
             free[between] = ~occluded(scene.objects[k], origins_m, towards, limits.take(between))
-    return alone, np.bincount(eye[free], minlength=n).astype(np.int32)
+    return alone.astype(np.int32), np.bincount(eye[free], minlength=n).astype(np.int32)
 
 
-def _directions(axes: F64, eye: npt.NDArray[np.int64], x: F32, y: F32) -> F32:
-    """Rays (R, 3) at depth 1 through x, y (R,) of the cameras `eye` (R,); `axes` (n, 3, 3) are columns."""
+def _repeated(points_m: F32, per_eye: Counts) -> F32:
+    """Each point (n, 3) as often as `per_eye` (n,) says: (R, 3)."""
+    return np.repeat(points_m.T, per_eye, axis=1).T  # several times faster than repeating triples
+
+
+def _directions(axes: F64, per_eye: Counts, x: F32, y: F32) -> F32:
+    """Rays (R, 3) at depth 1 through x, y (R,) of the cameras, of which each has `per_eye` (n,) rays.
+
+    `axes` (n, 3, 3) are columns.
+    """
     axes32 = axes.astype(np.float32)
-    directions = np.empty((len(eye), 3), np.float32)
-    for row in range(3):  # gathering single numbers is several times faster than gathering triples
-        right, down, forward = axes32[:, row].T
-        component = right.take(eye)
-        component *= x
-        across = down.take(eye)
-        across *= y
-        component += across
-        component += forward.take(eye)
+    directions = np.empty((len(x), 3), np.float32)
+    for row in range(3):
+        right, down, forward = np.repeat(axes32[:, row].T, per_eye, axis=1)
+        component = right * x
+        component += down * y
+        component += forward
         directions[:, row] = component
     return directions
 
 
 def _window_rays(
     target: RayMesh, T_world_target: F64, eyes_m: F64, axes: F64, half_width: F64, window: int
-) -> tuple[npt.NDArray[np.int64], F32, F32]:
-    """The window's pixels that may show the target: eye (R,), and x, y at depth 1 (R,), camera frame.
+) -> tuple[Counts, F32, F32]:
+    """The window's pixels that may show the target: numbers (n,) per eye, x, y at depth 1 (R,), camera frame.
 
-    A pixel outside the image of the target's bounding box cannot show it; leaving it out changes
+    A pixel outside the image of a polyhedron around the target cannot show it; leaving it out changes
     no count and saves most rays of a long thin target.
     """
-    corners_m = target.box_corners_m @ T_world_target[:3, :3].T + T_world_target[:3, 3]  # (8, 3)
-    rel = np.einsum("nci,nij->ncj", corners_m[None] - eyes_m[:, None], axes)  # (n, 8, 3)
+    corners_m = target.around_m @ T_world_target[:3, :3].T + T_world_target[:3, 3]  # (K, 3)
+    rel = (corners_m - eyes_m[:, None]) @ axes  # (n, K, 3)
     # A corner level with the eye or behind it has no image: then the whole window is cast.
     ahead = (rel[..., 2] > 1e-3).all(1)
-    image = rel[..., :2] / np.maximum(rel[..., 2:], 1e-3) / half_width[:, None, None]
-    low = np.where(ahead[:, None], image.min(1), -1.0)
-    high = np.where(ahead[:, None], image.max(1), 1.0)
+    image = rel[..., :2] / (np.maximum(rel[..., 2:], 1e-3) * half_width[:, None, None])
     centres = (np.arange(window, dtype=np.float64) + 0.5) / window * 2 - 1
-    slack = 1e-3
-    columns = (centres >= low[:, :1] - slack) & (centres <= high[:, :1] + slack)  # (n, window)
-    rows = (centres >= low[:, 1:] - slack) & (centres <= high[:, 1:] + slack)
-    eye, v, u = np.nonzero(rows[:, :, None] & columns[:, None, :])
-    scale = half_width[eye]
-    return eye, (centres[u] * scale).astype(np.float32), (centres[v] * scale).astype(np.float32)
+    # First and last position along each row (n, window), by the extents of x + slope y in the image.
+    first, last = np.full((2, len(eyes_m), window), [[[-1.0]], [[1.0]]])
+    for slope in _SLOPES:
+        across = image[..., 0] + slope * image[..., 1]
+        first = np.maximum(first, across.min(1)[:, None] - slope * centres)
+        last = np.minimum(last, across.max(1)[:, None] - slope * centres)
+    low, high = image[..., 1].min(1)[:, None], image[..., 1].max(1)[:, None]
+    last[(centres < low - _SLACK) | (centres > high + _SLACK)] = -np.inf
+    first[~ahead], last[~ahead] = -1.0, 1.0
+    pixels = (centres >= first[..., None] - _SLACK) & (centres <= last[..., None] + _SLACK)
+    per_eye, (_, v, u) = np.count_nonzero(pixels, axis=(1, 2)), np.nonzero(pixels)
+    scale = np.repeat(half_width, per_eye)
+    return per_eye, (centres[u] * scale).astype(np.float32), (centres[v] * scale).astype(np.float32)
 
 
 def _may_hide(scene: RayScene, k: int, target: int, eyes_m: F64, distance_m: F64) -> npt.NDArray[np.bool_]:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from datagen.schemas.fields import REDRAW_CAUSES
 from datagen.schemas.specification import SceneParams
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.geometry.planar import convex_hull, stack_polygons
+from datagen.workers.geometry.planar import convex_hull, following, stack_polygons
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.houses.house import House, Surface
 from datagen.workers.objects.model import ObjectModel
@@ -75,8 +75,9 @@ def nearby_parts(house: House, surface: Surface, margin_m: float) -> list[F32]:
     reach = np.abs(T[:2, :2]) @ (np.array(surface.size_m) / 2) + margin_m
     low = np.array([*(T[:2, 3] - reach), -1.0])
     high = np.array([*(T[:2, 3] + reach), surface.height_m + _ABOVE_M])
-    parts = (p for body in house.bodies for p in body.convex_parts_m)
-    return [p for p in parts if (p.max(0) >= low).all() and (p.min(0) <= high).all()]
+    part_low, part_high = house.part_boxes_m
+    near = ((part_high >= low) & (part_low <= high)).all(1)
+    return [house.parts_m[k] for k in np.flatnonzero(near)]
 
 
 def drop_poses(
@@ -161,7 +162,7 @@ def _overlap(a: F64, b: F64) -> Bools:
 
 def _separated(a: F64, b: F64) -> Bools:
     """Whether a side of polygon a (T, J, 2) separates it from polygon b (P, K, 2); (T, P)."""
-    edges = np.roll(a, -1, axis=1) - a
+    edges = following(a) - a
     normals = np.stack([edges[..., 1], -edges[..., 0]], axis=2)  # (T, J, 2), outward
     on_a = normals @ a.transpose(0, 2, 1)  # (T, J, J)
     on_b = (normals.reshape(-1, 2) @ b.reshape(-1, 2).T).reshape(*normals.shape[:2], *b.shape[:2])

@@ -39,3 +39,9 @@ def test_a_camera_looks_at_its_target_and_stays_upright(eye: tuple[float, float,
     np.testing.assert_allclose(seen[:3], [0, 0, np.linalg.norm(eye)], atol=1e-12)
     assert T[2, 0] == pytest.approx(0)  # the image's horizontal stays horizontal
     assert T[2, 1] <= 1e-12  # the image's down points down
+
+
+@given(st.lists(st.tuples(*[st.floats(-50, 50)] * 3).filter(lambda p: np.hypot.reduce(p) > 1e-3), min_size=1))
+def test_many_cameras_are_bit_for_bit_those_of_single_calls(eyes: list[tuple[float, float, float]]) -> None:
+    many = look_at(np.array(eyes), np.zeros(3))
+    assert many.tobytes() == np.stack([look_at(np.array(eye), np.zeros(3)) for eye in eyes]).tobytes()

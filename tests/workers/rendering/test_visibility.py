@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from datagen.workers.objects.model import ObjectModel
 from datagen.workers.rendering.embree import ray_scene
 from datagen.workers.rendering.visibility import visible_pixels
 from tests.independent import pixel_counts
@@ -91,3 +94,25 @@ def test_blocks_of_rays_do_not_change_counts(monkeypatch: pytest.MonkeyPatch) ->
     whole = visible_pixels(stage, 0, eyes, 32)
     monkeypatch.setattr("datagen.workers.rendering.visibility._MAX_RAYS", 32 * 32 * 7)
     np.testing.assert_array_equal(whole, visible_pixels(stage, 0, eyes, 32))
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        BOX,
+        ball_model("ball", 0.06),
+        cylinder_model("long", 0.004, 0.3),
+        box_model("sheet", (0.2, 0.1, 0.0)),
+    ],
+    ids=lambda model: model.name,
+)
+def test_pixels_left_out_around_the_target_change_no_count(model: ObjectModel) -> None:
+    stage = ray_scene(stage_with([model], [(0, 0)]))
+    target = stage.objects[0]
+    axes = np.random.default_rng(2).normal(size=(500, 3))
+    assert ((target.mesh.vertices_m @ axes.T).max(0) <= (target.around_m @ axes.T).max(0)).all()
+    eyes = np.random.default_rng(3).uniform((1.2, 0.7, 0.0), (2.8, 2.3, 1.5), (60, 3))
+    few = visible_pixels(stage, 0, eyes, 64)
+    target.__dict__["around_m"] = np.array(list(product((-9.0, 9.0), repeat=3)))  # the whole window
+    np.testing.assert_array_equal(few, visible_pixels(stage, 0, eyes, 64))
+    assert few[0].any()
