@@ -125,7 +125,8 @@ class JobMonitor(JobProgress):
         now_s = self._clock()
         if now_s >= self._next_look_s:
             self._next_look_s = now_s + LOOK_S
-            self._check()
+            with suppress(StoreUnavailable):
+                self._check()
             self._recorder.pass_on_request(self._stop)
         if now_s >= self._next_beat_s:
             self._next_beat_s = now_s + BEAT_S
