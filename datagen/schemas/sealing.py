@@ -25,7 +25,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import TABLES, Field, RecordSchema, Table
 from datagen.schemas.record_files import encode_record, read_record
 from datagen.schemas.run import Rows, Run, open_runs
-from datagen.schemas.run_records import Commit, FileEntry, Layout, SealedPart, StoreRecord
+from datagen.schemas.run_records import Commit, Cost, FileEntry, Host, Layout, SealedPart, StoreRecord
 from datagen.schemas.shard_files import (
     cf_attributes,
     described,
@@ -117,7 +117,7 @@ def read_contents(runs: Sequence[Run]) -> Contents:
     held: list[tuple[Run, int, tuple[Commit, ...]]] = []
     for run in runs:
         planned = run.planned(n := run.n)
-        held.append((run, n, tuple(commit for commit in run.commits() if commit.shard in planned)))
+        held.append((run, n, tuple(map(_in_brief, (c for c in run.commits() if c.shard in planned)))))
     last = max((k for k, (_, _, commits) in enumerate(held) if commits), default=None)
     if last is None:
         place = first.storage.url
@@ -125,6 +125,15 @@ def read_contents(runs: Sequence[Run]) -> Contents:
     sealed = tuple(SealedRun(run, n, commits, k == last) for k, (run, n, commits) in enumerate(held))
     layout = max((run.layout for run in runs), key=lambda layout: layout.scenes_per_shard)
     return Contents(sealed, first.schema, layout)
+
+
+_NO_HOST = Host(name="", cpu="", cores=0, memory_bytes=0)
+_LEFT_OUT = {"cost": Cost(wall_s=0, cpu_s=0), "host": _NO_HOST, "redraws": {}}
+
+
+def _in_brief(commit: Commit) -> Commit:
+    """The commit without cost and machine, most of its memory: those of all shards are held."""
+    return commit.model_copy(update=_LEFT_OUT)
 
 
 _ROOT = "zarr.json"
