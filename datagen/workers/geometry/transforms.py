@@ -86,13 +86,12 @@ def pose(position_m: F64, q_wxyz: F64) -> F64:
 def look_at(eye_m: F64, target_m: F64) -> F64:
     """(..., 4, 4) camera poses at `eye_m` (..., 3) that look at `target_m`: x right, y down, z forward.
 
-    The image stays upright. If the camera looks straight up or down, the world's x axis points
-    right.
+    The image stays upright. If the camera looks straight up or down, the world's x axis points right.
     """
     forward = np.asarray(target_m, np.float64) - eye_m
     forward = forward / np.sqrt(np.vecdot(forward, forward))[..., None]
-    # Forward x z.
-    right = np.stack([forward[..., 1], -forward[..., 0], np.zeros_like(forward[..., 0])], axis=-1)
+    level = np.zeros_like(forward[..., 0])
+    right = np.stack([forward[..., 1], -forward[..., 0], level], axis=-1)  # forward x z
     length = np.sqrt(np.vecdot(right, right))[..., None]
     right = np.where(length > 1e-9, right / np.maximum(length, 1e-9), [1.0, 0.0, 0.0])
     T = np.zeros((*forward.shape[:-1], 4, 4))

@@ -80,8 +80,7 @@ class House:
     def part_boxes_m(self) -> tuple[F32, F32]:
         """Lowest and highest corners (P, 3) of the bounding boxes of `parts_m`."""
         points_m = np.concatenate([np.empty((0, 3), np.float32), *self.parts_m])
-        ends = np.cumsum([len(part) for part in self.parts_m], dtype=np.int64)
-        starts = np.concatenate([[0], ends])[:-1]
+        starts = np.cumsum([0, *map(len, self.parts_m)])[:-1]
         return np.minimum.reduceat(points_m, starts), np.maximum.reduceat(points_m, starts)
 
     def room(self, room_id: str) -> Room:

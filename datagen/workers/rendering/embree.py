@@ -15,7 +15,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import HalfspaceIntersection
 
 from datagen.workers.geometry.mesh import F32, F64, I32, U8, Mesh, concatenate, face_normals
 from datagen.workers.houses.house import House
@@ -40,11 +39,12 @@ class RayMesh:
     @cached_property
     def around_m(self) -> F64:
         """Corners (K, 3), mesh frame, of a convex polyhedron of at most 26 faces that holds the mesh."""
+        from scipy.spatial import HalfspaceIntersection  # slow to import
+
         axes = np.array([axis for axis in product((-1.0, 0.0, 1.0), repeat=3) if any(axis)])
         points_m = self.mesh.vertices_m.astype(np.float64)
-        reach_m = (points_m @ axes.T).max(0) + _APART_M
-        centre_m = (points_m.min(0) + points_m.max(0)) / 2
-        return HalfspaceIntersection(np.column_stack([axes, -reach_m]), centre_m).intersections
+        faces = np.column_stack([axes, -(points_m @ axes.T).max(0) - _APART_M])
+        return HalfspaceIntersection(faces, (points_m.min(0) + points_m.max(0)) / 2).intersections
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,23 +76,17 @@ def _count(scene: RayScene, target: int, eyes_m: F64, distance_m: F64, window: i
 
 
 def _repeated(points_m: F32, per_eye: Counts) -> F32:
-    """Each point (n, 3) as often as `per_eye` (n,) says: (R, 3)."""
-    return np.repeat(points_m.T, per_eye, axis=1).T  # several times faster than repeating triples
+    """Each point (n, 3) as often as `per_eye` (n,) says, (R, 3); repeating triples is far slower."""
+    return np.repeat(points_m.T, per_eye, axis=1).T
 
 
 def _directions(axes: F64, per_eye: Counts, x: F32, y: F32) -> F32:
-    """Rays (R, 3) at depth 1 through x, y (R,) of the cameras, of which each has `per_eye` (n,) rays.
-
-    `axes` (n, 3, 3) are columns.
-    """
+    """Rays (R, 3) at depth 1 through x, y (R,), `per_eye` (n,) a camera; `axes` (n, 3, 3) are columns."""
     axes32 = axes.astype(np.float32)
     directions = np.empty((len(x), 3), np.float32)
     for row in range(3):
         right, down, forward = np.repeat(axes32[:, row].T, per_eye, axis=1)
-        component = right * x
-        component += down * y
-        component += forward
-        directions[:, row] = component
+        directions[:, row] = right * x + down * y + forward
     return directions
 
 
@@ -111,13 +105,13 @@ def _window_rays(
     image = rel[..., :2] / (np.maximum(rel[..., 2:], 1e-3) * half_width[:, None, None])
     centres = (np.arange(window, dtype=np.float64) + 0.5) / window * 2 - 1
     # First and last position along each row (n, window), by the extents of x + slope y in the image.
-    first, last = np.full((2, len(eyes_m), window), [[[-1.0]], [[1.0]]])
+    first, last = np.full((len(eyes_m), window), -1.0), np.full((len(eyes_m), window), 1.0)
     for slope in _SLOPES:
         across = image[..., 0] + slope * image[..., 1]
         first = np.maximum(first, across.min(1)[:, None] - slope * centres)
         last = np.minimum(last, across.max(1)[:, None] - slope * centres)
-    low, high = image[..., 1].min(1)[:, None], image[..., 1].max(1)[:, None]
-    last[(centres < low - _SLACK) | (centres > high + _SLACK)] = -np.inf
+    y = image[..., 1, None]
+    last[(centres < y.min(1) - _SLACK) | (centres > y.max(1) + _SLACK)] = -np.inf
     first[~ahead], last[~ahead] = -1.0, 1.0
     pixels = (centres >= first[..., None] - _SLACK) & (centres <= last[..., None] + _SLACK)
     per_eye, (_, v, u) = np.count_nonzero(pixels, axis=(1, 2)), np.nonzero(pixels)

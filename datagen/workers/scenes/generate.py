@@ -198,7 +198,7 @@ def _observe(
 
 
 _WINDOW_PX = 32  # rays per side to evaluate a viewpoint; coarser than for labels
-_BLOCK = 8
+_BLOCK = 4
 
 
 def draw_viewpoint(

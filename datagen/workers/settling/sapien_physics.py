@@ -48,8 +48,8 @@ def settle_sapien(
         for _ in range(min(_CHECK_EVERY, params.max_steps - steps)):
             scene.step()
             steps += 1
-        speed = _longest(np.array([b.linear_velocity for b in bodies], np.float32))
-        angular = _longest(np.array([b.angular_velocity for b in bodies], np.float32))
+        motions = np.array([(b.linear_velocity, b.angular_velocity) for b in bodies]).reshape(-1, 2, 3)
+        speed, angular = np.sqrt(np.vecdot(motions, motions)).max(0, initial=0.0).tolist()
         if not (np.isfinite(speed) and np.isfinite(angular)):
             break
         calm = speed < params.rest_speed_mps and angular < params.rest_angular_speed_radps
@@ -63,12 +63,6 @@ def settle_sapien(
         residual_speed_mps=speed,
         penetration_m=_deepest_contact(scene),
     )
-
-
-def _longest(vectors: F32) -> float:
-    """Length of the longest of vectors (K, 3); 0 without vectors, NaN where one is not finite."""
-    rows = vectors.reshape(-1, 3)
-    return float(np.sqrt(np.vecdot(rows, rows)).max(initial=0.0))
 
 
 def _deepest_contact(scene: sapien.Scene) -> float:
