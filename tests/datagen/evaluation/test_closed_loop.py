@@ -96,7 +96,7 @@ def test_without_error_the_outcome_is_the_label_and_two_processes_give_the_same(
 def by_scene(made: Path, grids: Path, scenes: Any) -> list[dict[str, str]]:
     """The outcomes of scenes, by the name that each scene's file has."""
     run = Run.open(grids)
-    places = ("builtin", "builtin")
+    places = ("builtin", "builtin", "")  # houses, objects, robot
     tasks = [
         SceneTask(
             run.storage.url, run.manifest.spec, *places, int(k), "plan", 0, str(made / "loop.arrivals"), ()
