@@ -1,0 +1,208 @@
+"""Forward and inverse kinematics of any tree of joints, compiled. Poses are (3, 4): rotation and position."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.motion.compiled.compiler import compiled
+from datagen.workers.robots.kinematic_tree import KinematicTree
+
+POSITION_TOLERANCE_M = 0.0005
+ANGLE_TOLERANCE_RAD = math.radians(0.5)
+_MAX_STEPS = 40
+_LONGEST_STEP = 1.0  # of any coordinate
+_DAMPING = 1e-4
+_DAMPING_PER_ERROR = 0.003
+# Fails when the best error has not fallen to this share within this number of steps.
+_PATIENCE, _PROGRESS = 8, 0.7
+_SMALL = 1e-10
+
+
+@compiled
+def compose(A: F64, B: F64, out: F64) -> None:
+    """out = A B for poses (3, 4); `out` is neither of them."""
+    for i in range(3):
+        a0, a1, a2 = A[i, 0], A[i, 1], A[i, 2]
+        for k in range(4):
+            out[i, k] = a0 * B[0, k] + a1 * B[1, k] + a2 * B[2, k]
+        out[i, 3] += A[i, 3]
+
+
+@compiled
+def joint_poses(tree: KinematicTree, T_root: F64, q: F64, out: F64) -> None:
+    """Poses (J, 3, 4) of the joints, moved by the coordinates (A,); `T_root` (3, 4) is that of the base."""
+    before = np.empty((3, 4))
+    for j in range(len(tree.parent)):
+        p = tree.parent[j]
+        compose(T_root if p < 0 else out[p], tree.T_parent_joint[j], before)
+        x = tree.ratio[j] * q[tree.coordinate[j]] + tree.offset[j]
+        a, b, c = tree.axis[j, 0], tree.axis[j, 1], tree.axis[j, 2]
+        if tree.slides[j]:
+            for i in range(3):
+                out[j, i, 0], out[j, i, 1], out[j, i, 2] = before[i, 0], before[i, 1], before[i, 2]
+                out[j, i, 3] = before[i, 3] + x * (a * before[i, 0] + b * before[i, 1] + c * before[i, 2])
+            continue
+        s, v = math.sin(x), 1.0 - math.cos(x)  # Rodrigues: I + s K + v K K
+        r00, r11, r22 = 1 - v * (b * b + c * c), 1 - v * (a * a + c * c), 1 - v * (a * a + b * b)
+        r01, r10 = v * a * b - s * c, v * a * b + s * c
+        r02, r20 = v * a * c + s * b, v * a * c - s * b
+        r12, r21 = v * b * c - s * a, v * b * c + s * a
+        for i in range(3):
+            x0, x1, x2 = before[i, 0], before[i, 1], before[i, 2]
+            out[j, i, 0] = x0 * r00 + x1 * r10 + x2 * r20
+            out[j, i, 1] = x0 * r01 + x1 * r11 + x2 * r21
+            out[j, i, 2] = x0 * r02 + x1 * r12 + x2 * r22
+            out[j, i, 3] = before[i, 3]
+
+
+@compiled
+def frame_poses(tree: KinematicTree, T_root: F64, joints: F64, out: F64) -> None:
+    """Poses (F, 3, 4) of the frames, from those of the joints (J, 3, 4)."""
+    for f in range(len(tree.frame_joint)):
+        j = tree.frame_joint[f]
+        compose(T_root if j < 0 else joints[j], tree.T_joint_frame[f], out[f])
+
+
+@compiled
+def tcp_pose(tree: KinematicTree, T_root: F64, joints: F64, out: F64) -> None:
+    """Pose (3, 4) of the last frame, the TCP."""
+    j = tree.frame_joint[-1]
+    compose(T_root if j < 0 else joints[j], tree.T_joint_frame[-1], out)
+
+
+@compiled
+def pose_error(T: F64, goal: F64, out: F64) -> None:
+    """Twist (6,) in the frame T that leads to the goal: position, then rotation (logarithm of SE(3))."""
+    R = np.empty((3, 3))
+    p = np.empty(3)
+    for i in range(3):
+        p[i] = 0.0
+        for k in range(3):
+            p[i] += T[k, i] * (goal[k, 3] - T[k, 3])
+            R[i, k] = T[0, i] * goal[0, k] + T[1, i] * goal[1, k] + T[2, i] * goal[2, k]
+    wx, wy, wz = (R[2, 1] - R[1, 2]) / 2, (R[0, 2] - R[2, 0]) / 2, (R[1, 0] - R[0, 1]) / 2
+    s, c = math.sqrt(wx * wx + wy * wy + wz * wz), (R[0, 0] + R[1, 1] + R[2, 2] - 1) / 2
+    angle = math.atan2(s, c)
+    if s > 1e-7:
+        wx, wy, wz = wx * angle / s, wy * angle / s, wz * angle / s
+    elif c < 0:  # half a turn: the axis by the largest column of R + I
+        k = 0
+        for i in range(1, 3):
+            if R[i, i] > R[k, k]:
+                k = i
+        n = math.sqrt((R[k, k] + 1) / 2)
+        w = np.empty(3)
+        for i in range(3):
+            w[i] = angle * (n if i == k else (R[i, k] + R[k, i]) / (4 * n))
+        wx, wy, wz = w[0], w[1], w[2]
+    # V^-1 p = p - w x p / 2 + b w x (w x p)
+    b = 1 / 12.0
+    if angle > 1e-4:
+        b = (1 - angle * math.sin(angle) / (2 * (1 - math.cos(angle)))) / (angle * angle)
+    x, y, z = wy * p[2] - wz * p[1], wz * p[0] - wx * p[2], wx * p[1] - wy * p[0]
+    out[0] = p[0] - x / 2 + b * (wy * z - wz * y)
+    out[1] = p[1] - y / 2 + b * (wz * x - wx * z)
+    out[2] = p[2] - z / 2 + b * (wx * y - wy * x)
+    out[3], out[4], out[5] = wx, wy, wz
+
+
+@compiled
+def tcp_jacobian(tree: KinematicTree, joints: F64, T: F64, out: F64) -> None:
+    """Jacobian (A, 6), one row a coordinate: twist of the TCP at T in its own frame."""
+    out[:] = 0.0
+    j = tree.frame_joint[-1]
+    while j >= 0:
+        a, b, c = tree.axis[j, 0], tree.axis[j, 1], tree.axis[j, 2]
+        P = joints[j]
+        ax = P[0, 0] * a + P[0, 1] * b + P[0, 2] * c
+        ay = P[1, 0] * a + P[1, 1] * b + P[1, 2] * c
+        az = P[2, 0] * a + P[2, 1] * b + P[2, 2] * c
+        k, ratio = tree.coordinate[j], tree.ratio[j]
+        vx, vy, vz = ax, ay, az
+        if not tree.slides[j]:
+            dx, dy, dz = T[0, 3] - P[0, 3], T[1, 3] - P[1, 3], T[2, 3] - P[2, 3]
+            vx, vy, vz = ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx
+            for i in range(3):
+                out[k, 3 + i] += ratio * (T[0, i] * ax + T[1, i] * ay + T[2, i] * az)
+        for i in range(3):
+            out[k, i] += ratio * (T[0, i] * vx + T[1, i] * vy + T[2, i] * vz)
+        j = tree.parent[j]
+
+
+@compiled
+def _solve6(H: F64, e: F64) -> None:
+    """Solve H x = e in place by Cholesky's decomposition; H (6, 6) is positive definite."""
+    for i in range(6):
+        for k in range(i + 1):
+            s = H[i, k]
+            for m in range(k):
+                s -= H[i, m] * H[k, m]
+            H[i, k] = math.sqrt(s) if i == k else s / H[k, k]
+    for i in range(6):
+        for m in range(i):
+            e[i] -= H[i, m] * e[m]
+        e[i] /= H[i, i]
+    for i in range(5, -1, -1):
+        for m in range(i + 1, 6):
+            e[i] -= H[m, i] * e[m]
+        e[i] /= H[i, i]
+
+
+@compiled
+def solve(tree: KinematicTree, T_root: F64, goal: F64, q: F64, work: Any) -> bool:
+    """Move the coordinates (A,), in place, until the TCP is at the goal (3, 4); whether it is.
+
+    Levenberg-Marquardt with damping that grows with the squared error (Sugihara 2011), on the pose error as
+    a twist in the TCP's frame; a coordinate at its limit stays there while the step pushes it out. The goal
+    is reached within 0.5 mm and 0.5 degrees.
+    """
+    joints, T, J = work
+    count = len(q)
+    e, H = np.empty(6), np.empty((6, 6))
+    for k in range(count):
+        q[k] = min(max(q[k], tree.lower[k]), tree.upper[k])
+    best, best_at = np.inf, 0
+    for step in range(_MAX_STEPS):
+        joint_poses(tree, T_root, q, joints)
+        tcp_pose(tree, T_root, joints, T)
+        pose_error(T, goal, e)
+        distance = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
+        angle = e[3] * e[3] + e[4] * e[4] + e[5] * e[5]
+        if distance < POSITION_TOLERANCE_M**2 and angle < ANGLE_TOLERANCE_RAD**2:
+            return True
+        squared = distance + angle
+        if squared < _PROGRESS**2 * best:
+            best, best_at = squared, step
+        elif step - best_at >= _PATIENCE:
+            return False
+        tcp_jacobian(tree, joints, T, J)
+        for i in range(6):
+            for k in range(i + 1):
+                s = 0.0
+                for m in range(count):
+                    s += J[m, i] * J[m, k]
+                H[i, k] = s
+            H[i, i] += _DAMPING + _DAMPING_PER_ERROR * squared
+        _solve6(H, e)
+        longest, scale = 0.0, 1.0
+        for m in range(count):
+            s = 0.0
+            for i in range(6):
+                s += J[m, i] * e[i]
+            J[m, 0] = s
+            longest = max(longest, abs(s))
+        if longest > _LONGEST_STEP:
+            scale = _LONGEST_STEP / longest
+        for m in range(count):
+            q[m] = min(max(q[m] + scale * J[m, 0], tree.lower[m]), tree.upper[m])
+    return False
+
+
+@compiled
+def ik_workspace(tree: KinematicTree) -> Any:
+    """Arrays that `solve` writes into: poses of the joints and of the TCP, and the Jacobian."""
+    return np.empty((len(tree.parent), 3, 4)), np.empty((3, 4)), np.empty((len(tree.lower), 6))

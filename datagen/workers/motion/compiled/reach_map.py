@@ -1,0 +1,183 @@
+"""Where a hand can be, seen from its base, with joint vectors that bring it near: a capability map.
+
+Random joint vectors are sorted into cells of the wrist's height and distance and the hand's direction and roll
+(Zacharias, Borst, Hirzinger 2007). An arm whose first turning joint stands upright is turned to the front first,
+so that this joint need not be sampled; for others the azimuth is one more axis.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.motion.compiled.compiler import compiled
+from datagen.workers.motion.compiled.kinematics import joint_poses, tcp_pose
+from datagen.workers.robots.kinematic_tree import Ints, KinematicTree
+
+_DISTANCES, _HEIGHTS, _SIDES, _ROLLS, _AZIMUTHS = 16, 32, 3, 8, 12
+_DIRECTIONS = 6 * _SIDES * _SIDES  # cells on the faces of a cube
+_APART = 1.0  # seeds with all coordinates nearer than this often lead to one solution
+_MOST_NEAR = 24  # samples among which seeds are chosen
+
+
+class ReachMap(NamedTuple):
+    """Samples by cell. Lengths are in units of `length_m`, so that scaled copies of an arm share the samples."""
+
+    first: Ints  # (C + 1,), rows of each cell's samples
+    q: F64  # (N, A), the hand turned to the front
+    length_m: float
+    axis_xy_m: F64  # (2,), base frame, of the upright axis
+    turn: int  # the coordinate that turns about it; -1 where there is none
+    tcp_wrist_m: F64  # (3,), TCP frame
+    half_m: float  # largest distance and height of the wrist
+
+
+@compiled
+def _cell(distance: float, height: float, azimuth: float, a: F64, c: F64, turns: bool) -> int:
+    """The cell of a hand at a distance and height (-1 to 1), approaching along a and closing along c, (3,)."""
+    i = min(int(distance * _DISTANCES), _DISTANCES - 1)
+    k = min(max(int((height + 1) / 2 * _HEIGHTS), 0), _HEIGHTS - 1)
+    face, largest = 0, abs(a[0])
+    for n in range(1, 3):
+        if abs(a[n]) > largest:
+            face, largest = n, abs(a[n])
+    u, v = a[(face + 1) % 3] / largest, a[(face + 2) % 3] / largest
+    if a[face] < 0:
+        face += 3
+    m = min(int((u + 1) / 2 * _SIDES), _SIDES - 1)
+    n = min(int((v + 1) / 2 * _SIDES), _SIDES - 1)
+    # Roll: the angle of c from the horizontal direction across a, or from y where a is steep.
+    ex, ey = -a[1], a[0]
+    if abs(a[2]) > 0.8:
+        ex, ey = 0.0, 1.0
+    dot = ex * a[0] + ey * a[1]
+    x, y, z = ex - dot * a[0], ey - dot * a[1], -dot * a[2]
+    px, py, pz = a[1] * z - a[2] * y, a[2] * x - a[0] * z, a[0] * y - a[1] * x
+    roll = math.atan2(c[0] * px + c[1] * py + c[2] * pz, c[0] * x + c[1] * y + c[2] * z)
+    r = min(int((roll / (2 * math.pi) + 0.5) * _ROLLS), _ROLLS - 1)
+    at = ((i * _HEIGHTS + k) * _DIRECTIONS + (face * _SIDES + m) * _SIDES + n) * _ROLLS + r
+    if turns:
+        return at
+    return at * _AZIMUTHS + min(int((azimuth / (2 * math.pi) + 0.5) * _AZIMUTHS), _AZIMUTHS - 1)
+
+
+@compiled
+def _feature(reach: ReachMap, T: F64, out: F64) -> float:
+    """Distance, height, approach and closing axis (8,) of a TCP pose (3, 4) in the base frame, turned to the front.
+
+    Returns the azimuth by which it was turned; the first number is above 1 where the wrist is out of the map.
+    """
+    w = reach.tcp_wrist_m
+    x = T[0, 0] * w[0] + T[0, 1] * w[1] + T[0, 2] * w[2] + T[0, 3] - reach.axis_xy_m[0]
+    y = T[1, 0] * w[0] + T[1, 1] * w[1] + T[1, 2] * w[2] + T[1, 3] - reach.axis_xy_m[1]
+    z = T[2, 0] * w[0] + T[2, 1] * w[1] + T[2, 2] * w[2] + T[2, 3]
+    azimuth = math.atan2(y, x)
+    c, s = math.cos(azimuth), math.sin(azimuth)
+    out[0], out[1] = math.sqrt(x * x + y * y) / reach.half_m, z / reach.half_m
+    for k in range(2):  # approach, closing axis
+        a, b = T[0, 2 - k], T[1, 2 - k]
+        out[2 + 3 * k], out[3 + 3 * k], out[4 + 3 * k] = c * a + s * b, c * b - s * a, T[2, 2 - k]
+    return azimuth
+
+
+@compiled
+def cells_near(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> float:
+    """The cell of a TCP pose (3, 4) in the base frame and the six next to it, (7,); -1 where there is none.
+
+    Returns the azimuth by which the hand was turned to the front.
+    """
+    azimuth = _feature(reach, T, feature)
+    turns = reach.turn >= 0
+    cells[:] = -1
+    distance, height = feature[0], feature[1]
+    if distance > 1 + 1 / _DISTANCES or abs(height) > 1 + 2 / _HEIGHTS:
+        return azimuth
+    a, c = feature[2:5], feature[5:8]
+    cells[0] = _cell(distance, height, azimuth, a, c, turns)
+    step = _ROLLS * _DIRECTIONS * (1 if turns else _AZIMUTHS)
+    per = 1 if turns else _AZIMUTHS
+    i, k, r = cells[0] // (step * _HEIGHTS), cells[0] // step % _HEIGHTS, cells[0] // per % _ROLLS
+    if i > 0:
+        cells[1] = cells[0] - step * _HEIGHTS
+    if i < _DISTANCES - 1:
+        cells[2] = cells[0] + step * _HEIGHTS
+    if k > 0:
+        cells[3] = cells[0] - step
+    if k < _HEIGHTS - 1:
+        cells[4] = cells[0] + step
+    cells[5] = cells[0] + per * ((r + 1) % _ROLLS - r)
+    cells[6] = cells[0] + per * ((r - 1) % _ROLLS - r)
+    return azimuth
+
+
+@compiled
+def score(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> int:
+    """How many samples lie near a TCP pose (3, 4) in the base frame: those of its own cell count eight times."""
+    cells_near(reach, T, cells, feature)
+    total = 0
+    for k in range(7):
+        if cells[k] >= 0:
+            total += (8 if k == 0 else 1) * (reach.first[cells[k] + 1] - reach.first[cells[k]])
+    return total
+
+
+@compiled
+def seeds(
+    reach: ReachMap, tree: KinematicTree, T: F64, out: F64, cells: Ints, feature: F64, near: F64, gap: F64
+) -> int:
+    """Joint vectors (S, A) of samples near a TCP pose (3, 4) that differ from each other; how many were found.
+
+    Each further one is the first that differs from those before by 1 in some coordinate, or where there is none
+    the one that differs most. `near` (24, A) and `gap` (24,) are scratch.
+    """
+    azimuth = cells_near(reach, T, cells, feature)
+    count, n = out.shape[1], 0
+    for k in range(7):
+        if cells[k] < 0 or n == len(near):
+            continue
+        for row in range(reach.first[cells[k]], reach.first[cells[k] + 1]):
+            if n == len(near):
+                break
+            for m in range(count):
+                x = reach.q[row, m]
+                if m == reach.turn:
+                    x += azimuth
+                    x -= 2 * math.pi * math.floor(x / (2 * math.pi) + 0.5)
+                near[n, m] = min(max(x, tree.lower[m]), tree.upper[m])
+            gap[n] = np.inf
+            n += 1
+    found, best = min(n, len(out)), 0
+    for s in range(found):
+        for m in range(count):
+            out[s, m] = near[best, m]
+        last, best = best, 0
+        most = -1.0
+        for k in range(n):
+            apart = 0.0
+            for m in range(count):
+                apart = max(apart, abs(near[k, m] - near[last, m]))
+            gap[k] = min(gap[k], apart)
+            if min(gap[k], _APART) > most:
+                most, best = min(gap[k], _APART), k
+    return found
+
+
+@compiled
+def fill(reach: ReachMap, tree: KinematicTree, q: F64, cell: Ints) -> None:
+    """The cells (N,) of joint vectors (N, A), whose turning coordinate is turned to the front in place."""
+    joints, T, root = np.empty((len(tree.parent), 3, 4)), np.empty((3, 4)), np.zeros((3, 4))
+    root[0, 0] = root[1, 1] = root[2, 2] = 1.0
+    feature = np.empty(8)
+    for k in range(len(q)):
+        joint_poses(tree, root, q[k], joints)
+        tcp_pose(tree, root, joints, T)
+        azimuth = _feature(reach, T, feature)
+        cell[k] = _cell(feature[0], feature[1], azimuth, feature[2:5], feature[5:8], reach.turn >= 0)
+        if reach.turn >= 0:
+            q[k, reach.turn] -= azimuth
+
+
+CELLS = _DISTANCES * _HEIGHTS * _DIRECTIONS * _ROLLS
