@@ -13,7 +13,7 @@ import numpy as np
 
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.motion.compiled.compiler import compiled
-from datagen.workers.robots.kinematic_tree import Bools, Ints
+from datagen.workers.robots.kinematic_tree import Ints
 
 _MAX_STEPS = 100
 _CONVERGED = 1e-12  # relative, of the squared distance
@@ -28,6 +28,7 @@ class Parts(NamedTuple):
     owner: Ints  # (P,)
     center_m: F64  # (P, 3)
     half_m: F64  # (P, 3)
+    touches: Ints  # (P,), kinds of still parts that each may touch
 
 
 @compiled
@@ -249,7 +250,7 @@ def hits_still(
             low, high = still.low_m[f], still.high_m[f]
             if cx - hx > high[0] or cx + hx < low[0] or cy - hy > high[1] or cy + hy < low[1]:
                 continue
-            if cz - hz > high[2] or cz + hz < low[2] or still.kind[f] & ignored:
+            if cz - hz > high[2] or cz + hz < low[2] or still.kind[f] & (ignored | parts.touches[p]):
                 continue
             # The still box along the moving part's own axes: this drops most pairs of long, tilted parts.
             mx, my, mz = (low[0] + high[0]) / 2 - cx, (low[1] + high[1]) / 2 - cy, (low[2] + high[2]) / 2 - cz
@@ -325,7 +326,7 @@ def smallest_gap_m(
         A = parts.points_m[parts.first[p] : parts.first[p + 1]]
         for n in range(len(rows)):
             f = rows[n]
-            if still.kind[f] & ignored:
+            if still.kind[f] & (ignored | parts.touches[p]):
                 continue
             squared = 0.0
             for i in range(3):
@@ -338,3 +339,13 @@ def smallest_gap_m(
             B = still.points_m[still.first[f] : still.first[f + 1]]
             best = min(best, gap_m(A, M, B, 0.0, best, s.axes[p, f], s.W, s.v))
     return best
+
+
+@compiled
+def hit_any(parts: Parts, T: F64, still: Still, rows: Ints) -> bool:
+    """Whether the parts touch a still part of `rows` at any of the poses T (N, O, 3, 4) of their owners."""
+    s = scratch_of(len(parts.owner), len(still.kind))
+    for k in range(len(T)):
+        if hits_still(parts, T[k], still, rows, 0, 0.0, s):
+            return True
+    return False

@@ -12,23 +12,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.mesh import F32, F64, I32
 from datagen.workers.motion.compiled.compiler import compiled
 from datagen.workers.motion.compiled.kinematics import joint_poses, tcp_pose
 from datagen.workers.robots.kinematic_tree import Ints, KinematicTree
 
-_DISTANCES, _HEIGHTS, _SIDES, _ROLLS, _AZIMUTHS = 16, 32, 3, 8, 12
+_DISTANCES, _HEIGHTS, _SIDES, _ROLLS, AZIMUTHS = 16, 32, 3, 8, 12
 _DIRECTIONS = 6 * _SIDES * _SIDES  # cells on the faces of a cube
 _APART = 1.0  # seeds with all coordinates nearer than this often lead to one solution
 _MOST_NEAR = 24  # samples among which seeds are chosen
 
 
 class ReachMap(NamedTuple):
-    """Samples by cell. Lengths are in units of `length_m`, so that scaled copies of an arm share the samples."""
+    """Samples of joint vectors, sorted by cell."""
 
-    first: Ints  # (C + 1,), rows of each cell's samples
-    q: F64  # (N, A), the hand turned to the front
-    length_m: float
+    first: I32  # (C + 1,), rows of each cell's samples
+    q: F32  # (N, A), the hand turned to the front
     axis_xy_m: F64  # (2,), base frame, of the upright axis
     turn: int  # the coordinate that turns about it; -1 where there is none
     tcp_wrist_m: F64  # (3,), TCP frame
@@ -61,7 +60,7 @@ def _cell(distance: float, height: float, azimuth: float, a: F64, c: F64, turns:
     at = ((i * _HEIGHTS + k) * _DIRECTIONS + (face * _SIDES + m) * _SIDES + n) * _ROLLS + r
     if turns:
         return at
-    return at * _AZIMUTHS + min(int((azimuth / (2 * math.pi) + 0.5) * _AZIMUTHS), _AZIMUTHS - 1)
+    return at * AZIMUTHS + min(int((azimuth / (2 * math.pi) + 0.5) * AZIMUTHS), AZIMUTHS - 1)
 
 
 @compiled
@@ -97,8 +96,8 @@ def cells_near(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> float:
         return azimuth
     a, c = feature[2:5], feature[5:8]
     cells[0] = _cell(distance, height, azimuth, a, c, turns)
-    step = _ROLLS * _DIRECTIONS * (1 if turns else _AZIMUTHS)
-    per = 1 if turns else _AZIMUTHS
+    step = _ROLLS * _DIRECTIONS * (1 if turns else AZIMUTHS)
+    per = 1 if turns else AZIMUTHS
     i, k, r = cells[0] // (step * _HEIGHTS), cells[0] // step % _HEIGHTS, cells[0] // per % _ROLLS
     if i > 0:
         cells[1] = cells[0] - step * _HEIGHTS
@@ -166,16 +165,16 @@ def seeds(
 
 
 @compiled
-def fill(reach: ReachMap, tree: KinematicTree, q: F64, cell: Ints) -> None:
-    """The cells (N,) of joint vectors (N, A), whose turning coordinate is turned to the front in place."""
+def fill(reach: ReachMap, tree: KinematicTree, q: F64, cell: Ints, features: F64) -> None:
+    """Cells (N,) and features (N, 8) of joint vectors (N, A), which are turned to the front in place."""
     joints, T, root = np.empty((len(tree.parent), 3, 4)), np.empty((3, 4)), np.zeros((3, 4))
     root[0, 0] = root[1, 1] = root[2, 2] = 1.0
-    feature = np.empty(8)
     for k in range(len(q)):
         joint_poses(tree, root, q[k], joints)
         tcp_pose(tree, root, joints, T)
-        azimuth = _feature(reach, T, feature)
-        cell[k] = _cell(feature[0], feature[1], azimuth, feature[2:5], feature[5:8], reach.turn >= 0)
+        f = features[k]
+        azimuth = _feature(reach, T, f)
+        cell[k] = _cell(f[0], f[1], azimuth, f[2:5], f[5:8], reach.turn >= 0)
         if reach.turn >= 0:
             q[k, reach.turn] -= azimuth
 

@@ -30,7 +30,7 @@ from datagen.workers.motion.compiled.kinematics import (
     tcp_pose,
 )
 from datagen.workers.motion.compiled.reach_map import ReachMap, score, seeds
-from datagen.workers.robots.kinematic_tree import Ints, KinematicTree
+from datagen.workers.robots.kinematic_tree import Bools, Ints, KinematicTree
 
 TARGET, FLOOR = 1, 2  # kinds of still parts
 NO_IK, ARM_COLLISION, NO_START, NO_APPROACH, NO_LIFT, NO_PATH, SUCCESS = range(7)
@@ -67,9 +67,9 @@ class Hand(NamedTuple):
     core_points_m: F64  # (O, W, 3)
     core_center_m: F64  # (O, P, 3)
     core_half_m: F64  # (O, P, 3)
-    first: Ints  # (P + 1,)
+    first: Ints  # (P + 1,), rows of each part's corners
     core_first: Ints  # (P + 1,)
-    owner: Ints  # (P,), zeros
+    zeros: Ints  # (P,)
 
 
 class Poses(NamedTuple):
@@ -105,16 +105,22 @@ class Room(NamedTuple):
     near_target: Ints  # parts that the hand can touch while it grasps and lifts
 
 
+class HandWork(NamedTuple):
+    """Arrays that checks of the hand write into."""
+
+    frame: F64  # (1, 3, 4), the TCP
+    whole: Scratch
+    core: Scratch
+
+
 class Work(NamedTuple):
     """Arrays that the search writes into."""
 
     joints: F64  # (J, 3, 4)
     frames: F64  # (F + 1, 3, 4), the last is the base
-    hand_frame: F64  # (1, 3, 4)
     ik: Any
     body: Scratch
-    hand: Scratch
-    core: Scratch
+    hand: HandWork
     own_axes: F64  # (K, 3)
 
 
@@ -130,7 +136,14 @@ class Found(NamedTuple):
 
 @compiled
 def _hand_parts(hand: Hand, opening: int) -> Parts:
-    return Parts(hand.points_m[opening], hand.first, hand.owner, hand.center_m[opening], hand.half_m[opening])
+    return Parts(
+        hand.points_m[opening],
+        hand.first,
+        hand.zeros,
+        hand.center_m[opening],
+        hand.half_m[opening],
+        hand.zeros,
+    )
 
 
 @compiled
@@ -138,9 +151,10 @@ def _core_parts(hand: Hand, opening: int) -> Parts:
     return Parts(
         hand.core_points_m[opening],
         hand.core_first,
-        hand.owner,
+        hand.zeros,
         hand.core_center_m[opening],
         hand.core_half_m[opening],
+        hand.zeros,
     )
 
 
@@ -160,13 +174,13 @@ def _moved(T: F64, back_m: float, rise_m: float, out: F64) -> None:
 
 
 @compiled
-def clears_target(hand: Hand, room: Room, limits: Limits, T: F64, opening: int, w: Work) -> bool:
+def clears_target(hand: Hand, room: Room, limits: Limits, T: F64, opening: int, w: HandWork) -> bool:
     """Whether the hand clears the target along its approach; its core may not touch, its skin may."""
     parts, core = _hand_parts(hand, opening), _core_parts(hand, opening)
-    still, rows, at = room.still, room.near_target, w.hand_frame
+    still, rows, at = room.still, room.near_target, w.frame
     n = points_on(limits.pregrasp_m, limits.line_step_m)
     _moved(T, limits.pregrasp_m, 0.0, at[0])
-    if hits_still(parts, at, still, rows, ~TARGET, limits.margin_m + limits.slack_m, w.hand):
+    if hits_still(parts, at, still, rows, ~TARGET, limits.margin_m + limits.slack_m, w.whole):
         return False
     for k in range(n - 1):
         _moved(T, limits.pregrasp_m * k / (n - 1), 0.0, at[0])
@@ -176,29 +190,29 @@ def clears_target(hand: Hand, room: Room, limits: Limits, T: F64, opening: int, 
 
 
 @compiled
-def is_hand_free(hand: Hand, room: Room, limits: Limits, T: F64, opening: int, w: Work) -> bool:
+def is_hand_free(hand: Hand, room: Room, limits: Limits, T: F64, opening: int, w: HandWork) -> bool:
     """Whether the hand clears all but the target along its approach and while it lifts."""
     parts = _hand_parts(hand, opening)
-    still, rows, at = room.still, room.near_target, w.hand_frame
+    still, rows, at = room.still, room.near_target, w.frame
     _moved(T, 0.0, 0.0, at[0])
-    if hits_still(parts, at, still, rows, TARGET, limits.hand_margin_m, w.hand):
+    if hits_still(parts, at, still, rows, TARGET, limits.hand_margin_m, w.whole):
         return False
     n = points_on(limits.pregrasp_m, limits.line_step_m)
     for k in range(n - 1, 0, -1):
         _moved(T, limits.pregrasp_m * k / (n - 1), 0.0, at[0])
         margin_m = limits.margin_m + limits.slack_m if k == n - 1 else limits.hand_margin_m
-        if hits_still(parts, at, still, rows, TARGET, margin_m, w.hand):
+        if hits_still(parts, at, still, rows, TARGET, margin_m, w.whole):
             return False
     n = points_on(limits.lift_m, limits.line_step_m)
     for k in range(1, n):
         _moved(T, 0.0, limits.lift_m * k / (n - 1), at[0])
-        if hits_still(parts, at, still, rows, TARGET, limits.hand_margin_m, w.hand):
+        if hits_still(parts, at, still, rows, TARGET, limits.hand_margin_m, w.whole):
             return False
     return True
 
 
 @compiled
-def _free(hand: Hand, room: Room, limits: Limits, poses: Poses, k: int, w: Work) -> bool:
+def _free(hand: Hand, room: Room, limits: Limits, poses: Poses, k: int, w: HandWork) -> bool:
     """Whether pose `k` is free for the hand; computed on first use."""
     if poses.clears[k] == 0:
         ok = clears_target(hand, room, limits, poses.T_world_tcp[k], poses.opening[k], w)
@@ -212,26 +226,40 @@ def _free(hand: Hand, room: Room, limits: Limits, poses: Poses, k: int, w: Work)
 
 
 @compiled
-def free_poses(hand: Hand, room: Room, limits: Limits, poses: Poses, first: int, end: int, w: Work) -> int:
-    """Check the poses from `first` to `end`; how many of them are free."""
-    total = 0
+def clear_poses(hand: Hand, room: Room, limits: Limits, T: F64, opening: Ints) -> Bools:
+    """Whether the hand at poses (K, 3, 4) clears the target (K,)."""
+    still, parts = len(room.still.kind), len(hand.zeros)
+    w, out = hand_workspace(parts, still), np.empty(len(T), np.bool_)
+    for k in range(len(T)):
+        out[k] = clears_target(hand, room, limits, T[k], opening[k], w)
+    return out
+
+
+@compiled
+def free_poses(hand: Hand, room: Room, limits: Limits, poses: Poses, first: int, end: int) -> int:
+    """Check the poses from `first` to `end` in the scene; how many of them are free."""
+    w, total = hand_workspace(len(hand.zeros), len(room.still.kind)), 0
     for k in range(first, end):
         total += _free(hand, room, limits, poses, k, w)
     return total
 
 
 @compiled
+def hand_workspace(parts: int, still: int) -> HandWork:
+    """Arrays for checks of the hand alone."""
+    return HandWork(np.empty((1, 3, 4)), scratch_of(parts, still), scratch_of(parts, still))
+
+
+@compiled
 def workspace(arm: Arm, hand: Hand, room: Room) -> Work:
     """Arrays for one candidate: no result depends on earlier ones."""
-    still, parts = len(room.still.kind), len(hand.owner)
+    still, parts = len(room.still.kind), len(hand.zeros)
     return Work(
         np.empty((len(arm.tree.parent), 3, 4)),
         np.empty((len(arm.tree.frame_joint) + 1, 3, 4)),
-        np.empty((1, 3, 4)),
         ik_workspace(arm.tree),
         scratch_of(len(arm.body.owner), still),
-        scratch_of(parts, still),
-        scratch_of(parts, still),
+        hand_workspace(parts, still),
         np.zeros((len(arm.own_pairs), 3)),
     )
 
@@ -261,9 +289,9 @@ def is_blocked(
     if hits_still(arm.body, w.frames, room.still, rows, ignored, limits.margin_m, w.body):
         return True
     if opening >= 0:
-        w.hand_frame[0] = w.frames[-2]
+        w.hand.frame[0] = w.frames[-2]
         parts = _hand_parts(hand, opening)
-        if hits_still(parts, w.hand_frame, room.still, rows, ignored, limits.margin_m, w.hand):
+        if hits_still(parts, w.hand.frame, room.still, rows, ignored, limits.margin_m, w.hand.whole):
             return True
     return hits_itself(arm.own, arm.own_pairs, w.frames, w.own_axes, w.body)
 
@@ -731,9 +759,9 @@ def _whole(
     for k in range(some):
         q = q_reach[int(round(k * (len(q_reach) - 1) / max(some - 1, 1)))]
         _pose_arm(arm, base.T_root, q, w)
-        w.hand_frame[0] = w.frames[-2]
+        w.hand.frame[0] = w.frames[-2]
         parts = _hand_parts(hand, opening)
-        clearance_m = smallest_gap_m(parts, w.hand_frame, room.still, base.rows, 0, clearance_m, w.hand)
+        clearance_m = smallest_gap_m(parts, w.hand.frame, room.still, base.rows, 0, clearance_m, w.hand.whole)
         clearance_m = smallest_gap_m(arm.body, w.frames, room.still, base.rows, 0, clearance_m, w.body)
     return Plan(
         SUCCESS, tried, row, found.T.copy(), opening, home, q_reach, found.back[::-1].copy(), found.lift.copy(),
@@ -846,7 +874,7 @@ def search(
             # A pose that cannot be lifted gets no further than that.
             if not is_liftable and (lifted[k] > 0 or furthest >= NO_LIFT):
                 continue
-            if poses.holds[k] < 0 or not _free(hand, room, limits, poses, k, w):
+            if poses.holds[k] < 0 or not _free(hand, room, limits, poses, k, w.hand):
                 continue
             tried += 1
             stage, home = _try_pose(
