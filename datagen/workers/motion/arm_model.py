@@ -50,7 +50,7 @@ def arm_of(robot: Robot, draw: int = 0) -> Arm:
     if key in _arms:
         _arms.move_to_end(key)
         return _arms[key][1]
-    tree = robot.tree
+    tree = robot.tree.along_z()
     links = robot.link_parts_m[: robot.first_hand_link]
     moves = tree.frame_joint[: len(links)] >= 0
     own = _own_parts(robot)

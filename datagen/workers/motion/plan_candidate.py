@@ -39,7 +39,7 @@ def plan_candidate(
         # Each search draws the same numbers: it goes on behind plans that were found not to hold.
         rng.bit_generator.state = state
         plan: Plan = search(
-            prepared.arm, around.hand, around.room, prepared.limits, poses, T_root, reach_m,
+            prepared.arm, around.hand, around.room, prepared.limits, poses, around.first, T_root, reach_m,
             robot.shoulder_m, prepared.params.nearby_rounds or 0, skips, rng,
         )  # fmt: skip
         if plan.stage != SUCCESS:

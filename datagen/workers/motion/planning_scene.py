@@ -61,6 +61,7 @@ class HandScene:
     grasps: GraspSet
     grasp: Ints  # (K,), row of `grasps`
     poses: Poses
+    first: int  # poses that are checked in every scene
     grasps_free: int  # of those that are checked in every scene
     opening_m: F64  # (O,), of the hand
 
@@ -161,7 +162,7 @@ def hand_scene(
         free_poses(hand, room, limits, poses, first, len(grasp))
     free = len(np.unique(grasp[poses.is_free > 0]))
     opening_m = np.append(np.unique(grasps.opening_m.astype(np.float64)), gripper.max_opening_m)
-    return HandScene(room, hand, grasps, grasp, poses, free, opening_m)
+    return HandScene(room, hand, grasps, grasp, poses, first, free, opening_m)
 
 
 _clear: WeakKeyDictionary[GraspSet, dict[tuple[str, Limits], tuple[Hand, Ints, F64, Ints]]] = (

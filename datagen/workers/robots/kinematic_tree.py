@@ -34,6 +34,30 @@ class KinematicTree(NamedTuple):
     frame_joint: Ints  # (F,), the joint that carries each frame; -1 is the base
     T_joint_frame: F64  # (F, 4, 4)
 
+    def along_z(self) -> KinematicTree:
+        """The same tree with joint frames turned so that every axis is z."""
+        turn = np.stack([_z_to(axis) for axis in self.axis])
+        T_parent_joint = np.matmul(self.T_parent_joint, turn)
+        for j, parent in enumerate(self.parent.tolist()):
+            if parent >= 0:
+                T_parent_joint[j] = turn[parent].T @ T_parent_joint[j]
+        T_frame = self.T_joint_frame.copy()
+        carried = self.frame_joint >= 0
+        T_frame[carried] = np.matmul(turn[self.frame_joint[carried]].transpose(0, 2, 1), T_frame[carried])
+        axis = np.tile([0.0, 0.0, 1.0], (len(self.axis), 1))
+        return self._replace(T_parent_joint=T_parent_joint, axis=axis, T_joint_frame=T_frame)
+
+
+def _z_to(axis: F64) -> F64:
+    """A rotation (4, 4) that takes z to the unit axis (3,); the identity for z itself."""
+    x, y, z = axis
+    if z < -0.999999:
+        return np.diag([1.0, -1.0, -1.0, 1.0])
+    v = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
+    T = np.eye(4)
+    T[:3, :3] += v + v @ v / (1 + z)
+    return T
+
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:

@@ -215,17 +215,51 @@ class Still(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Arrays that checks write into; `axes` holds a direction between each moving and each still part."""
+    """Arrays that checks of P moving and F still parts write into."""
 
     W: F64  # (4, 3)
     v: F64  # (3,)
-    axes: F64  # (P, F, 3)
+    axes: F64  # (P, F, 3), a direction between each moving and each still part
+    center_m: F64  # (P, 3), of the moving parts' boxes
+    half_m: F64  # (P, 3)
+    near: Ints  # (F,)
 
 
 @compiled
 def scratch_of(moving: int, still: int) -> Scratch:
     """Arrays for the checks of so many moving and still parts."""
-    return Scratch(np.empty((4, 3)), np.empty(3), np.zeros((moving, still, 3)))
+    return Scratch(
+        np.empty((4, 3)),
+        np.empty(3),
+        np.zeros((moving, still, 3)),
+        np.empty((moving, 3)),
+        np.empty((moving, 3)),
+        np.empty(still, np.int64),
+    )
+
+
+@compiled
+def _boxes(
+    parts: Parts, T: F64, margin_m: float, s: Scratch
+) -> tuple[float, float, float, float, float, float]:
+    """Boxes of the posed parts along the still parts' axes, grown by the margin; returns the box of all."""
+    lx = ly = lz = np.inf
+    hx = hy = hz = -np.inf
+    for p in range(len(parts.owner)):
+        M, c, h, center, half = (
+            T[parts.owner[p]],
+            parts.center_m[p],
+            parts.half_m[p],
+            s.center_m[p],
+            s.half_m[p],
+        )
+        for i in range(3):
+            center[i] = M[i, 0] * c[0] + M[i, 1] * c[1] + M[i, 2] * c[2] + M[i, 3]
+            half[i] = abs(M[i, 0]) * h[0] + abs(M[i, 1]) * h[1] + abs(M[i, 2]) * h[2] + margin_m
+        lx, hx = min(lx, center[0] - half[0]), max(hx, center[0] + half[0])
+        ly, hy = min(ly, center[1] - half[1]), max(hy, center[1] + half[1])
+        lz, hz = min(lz, center[2] - half[2]), max(hz, center[2] + half[2])
+    return lx, ly, lz, hx, hy, hz
 
 
 @compiled
@@ -236,21 +270,26 @@ def hits_still(
 
     Only still parts of `rows` count, and none with a bit of `ignored`.
     """
+    lx, ly, lz, hx, hy, hz = _boxes(parts, T, margin_m, s)
+    count = 0
+    for n in range(len(rows)):
+        f = rows[n]
+        low, high = still.low_m[f], still.high_m[f]
+        is_apart = (
+            (lz > high[2]) | (hz < low[2]) | (lx > high[0]) | (hx < low[0]) | (ly > high[1]) | (hy < low[1])
+        )
+        s.near[count] = f
+        count += not (is_apart or still.kind[f] & ignored)
     for p in range(len(parts.owner)):
-        M = T[parts.owner[p]]
-        c, h = parts.center_m[p], parts.half_m[p]
-        cx = M[0, 0] * c[0] + M[0, 1] * c[1] + M[0, 2] * c[2] + M[0, 3]
-        cy = M[1, 0] * c[0] + M[1, 1] * c[1] + M[1, 2] * c[2] + M[1, 3]
-        cz = M[2, 0] * c[0] + M[2, 1] * c[1] + M[2, 2] * c[2] + M[2, 3]
-        hx = abs(M[0, 0]) * h[0] + abs(M[0, 1]) * h[1] + abs(M[0, 2]) * h[2] + margin_m
-        hy = abs(M[1, 0]) * h[0] + abs(M[1, 1]) * h[1] + abs(M[1, 2]) * h[2] + margin_m
-        hz = abs(M[2, 0]) * h[0] + abs(M[2, 1]) * h[1] + abs(M[2, 2]) * h[2] + margin_m
-        for n in range(len(rows)):
-            f = rows[n]
+        M, h = T[parts.owner[p]], parts.half_m[p]
+        cx, cy, cz = s.center_m[p, 0], s.center_m[p, 1], s.center_m[p, 2]
+        wx, wy, wz = s.half_m[p, 0], s.half_m[p, 1], s.half_m[p, 2]
+        for n in range(count):
+            f = s.near[n]
             low, high = still.low_m[f], still.high_m[f]
-            if cx - hx > high[0] or cx + hx < low[0] or cy - hy > high[1] or cy + hy < low[1]:
+            if cx - wx > high[0] or cx + wx < low[0] or cy - wy > high[1] or cy + wy < low[1]:
                 continue
-            if cz - hz > high[2] or cz + hz < low[2] or still.kind[f] & (ignored | parts.touches[p]):
+            if cz - wz > high[2] or cz + wz < low[2] or still.kind[f] & parts.touches[p]:
                 continue
             # The still box along the moving part's own axes: this drops most pairs of long, tilted parts.
             mx, my, mz = (low[0] + high[0]) / 2 - cx, (low[1] + high[1]) / 2 - cy, (low[2] + high[2]) / 2 - cz
@@ -281,10 +320,25 @@ def _relative(A: F64, B: F64, out: F64) -> None:
 
 @compiled
 def hits_itself(parts: Parts, pairs: Ints, T: F64, axes: F64, s: Scratch) -> bool:
-    """Whether any pair (K, 2) of the parts touches, their owners posed by T (O, 3, 4); `axes` is (K, 3)."""
+    """Whether any pair (K, 2) of the parts touches, their owners posed by T (O, 3, 4).
+
+    `axes` is (K, 3). The first column of `s.half_m` has the parts' radii around their boxes' centres.
+    """
     M = np.empty((3, 4))
+    for p in range(len(parts.owner)):
+        N, c = T[parts.owner[p]], parts.center_m[p]
+        for i in range(3):
+            s.center_m[p, i] = N[i, 0] * c[0] + N[i, 1] * c[1] + N[i, 2] * c[2] + N[i, 3]
     for k in range(len(pairs)):
         a, b = pairs[k, 0], pairs[k, 1]
+        x, y, z = (
+            s.center_m[a, 0] - s.center_m[b, 0],
+            s.center_m[a, 1] - s.center_m[b, 1],
+            s.center_m[a, 2] - s.center_m[b, 2],
+        )
+        reach = s.half_m[a, 0] + s.half_m[b, 0]
+        if x * x + y * y + z * z > reach * reach:
+            continue
         _relative(T[parts.owner[a]], T[parts.owner[b]], M)
         c, h, low, half = parts.center_m[a], parts.half_m[a], parts.center_m[b], parts.half_m[b]
         is_apart = False
@@ -320,9 +374,9 @@ def smallest_gap_m(
 ) -> float:
     """The smallest distance of the parts to the still ones, at most `far_m`; as `hits_still`."""
     best = far_m
+    _boxes(parts, T, 0.0, s)
     for p in range(len(parts.owner)):
-        M = T[parts.owner[p]]
-        c, h = parts.center_m[p], parts.half_m[p]
+        M, center, half = T[parts.owner[p]], s.center_m[p], s.half_m[p]
         A = parts.points_m[parts.first[p] : parts.first[p + 1]]
         for n in range(len(rows)):
             f = rows[n]
@@ -330,9 +384,7 @@ def smallest_gap_m(
                 continue
             squared = 0.0
             for i in range(3):
-                m = M[i, 0] * c[0] + M[i, 1] * c[1] + M[i, 2] * c[2] + M[i, 3]
-                size = abs(M[i, 0]) * h[0] + abs(M[i, 1]) * h[1] + abs(M[i, 2]) * h[2]
-                apart = max(still.low_m[f, i] - m, m - still.high_m[f, i]) - size
+                apart = max(still.low_m[f, i] - center[i], center[i] - still.high_m[f, i]) - half[i]
                 squared += max(apart, 0.0) ** 2
             if squared >= best * best:
                 continue
@@ -349,3 +401,16 @@ def hit_any(parts: Parts, T: F64, still: Still, rows: Ints) -> bool:
         if hits_still(parts, T[k], still, rows, 0, 0.0, s):
             return True
     return False
+
+
+@compiled
+def radii_m(parts: Parts, out: F64) -> None:
+    """Radii (P,) of the parts around their boxes' centres."""
+    for p in range(len(parts.owner)):
+        most = 0.0
+        for v in range(parts.first[p], parts.first[p + 1]):
+            squared = 0.0
+            for i in range(3):
+                squared += (parts.points_m[v, i] - parts.center_m[p, i]) ** 2
+            most = max(most, squared)
+        out[p] = math.sqrt(most)

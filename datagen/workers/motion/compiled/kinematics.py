@@ -1,4 +1,7 @@
-"""Forward and inverse kinematics of any tree of joints, compiled. Poses are (3, 4): rotation and position."""
+"""Forward and inverse kinematics of any tree of joints, compiled. Poses are (3, 4): rotation and position.
+
+The joints' axes are z: `KinematicTree.along_z` turns their frames so.
+"""
 
 from __future__ import annotations
 
@@ -24,39 +27,33 @@ _SMALL = 1e-10
 
 @compiled
 def compose(A: F64, B: F64, out: F64) -> None:
-    """out = A B for poses (3, 4); `out` is neither of them."""
+    """out = A B for poses (3, 4)."""
+    b00, b01, b02, b03 = B[0, 0], B[0, 1], B[0, 2], B[0, 3]
+    b10, b11, b12, b13 = B[1, 0], B[1, 1], B[1, 2], B[1, 3]
+    b20, b21, b22, b23 = B[2, 0], B[2, 1], B[2, 2], B[2, 3]
     for i in range(3):
-        a0, a1, a2 = A[i, 0], A[i, 1], A[i, 2]
-        for k in range(4):
-            out[i, k] = a0 * B[0, k] + a1 * B[1, k] + a2 * B[2, k]
-        out[i, 3] += A[i, 3]
+        x, y, z, t = A[i, 0], A[i, 1], A[i, 2], A[i, 3]
+        out[i, 0] = x * b00 + y * b10 + z * b20
+        out[i, 1] = x * b01 + y * b11 + z * b21
+        out[i, 2] = x * b02 + y * b12 + z * b22
+        out[i, 3] = x * b03 + y * b13 + z * b23 + t
 
 
 @compiled
 def joint_poses(tree: KinematicTree, T_root: F64, q: F64, out: F64) -> None:
     """Poses (J, 3, 4) of the joints, moved by the coordinates (A,); `T_root` (3, 4) is that of the base."""
-    before = np.empty((3, 4))
     for j in range(len(tree.parent)):
-        p = tree.parent[j]
-        compose(T_root if p < 0 else out[p], tree.T_parent_joint[j], before)
+        p, T = tree.parent[j], out[j]
+        compose(T_root if p < 0 else out[p], tree.T_parent_joint[j], T)
         x = tree.ratio[j] * q[tree.coordinate[j]] + tree.offset[j]
-        a, b, c = tree.axis[j, 0], tree.axis[j, 1], tree.axis[j, 2]
         if tree.slides[j]:
             for i in range(3):
-                out[j, i, 0], out[j, i, 1], out[j, i, 2] = before[i, 0], before[i, 1], before[i, 2]
-                out[j, i, 3] = before[i, 3] + x * (a * before[i, 0] + b * before[i, 1] + c * before[i, 2])
+                T[i, 3] += x * T[i, 2]
             continue
-        s, v = math.sin(x), 1.0 - math.cos(x)  # Rodrigues: I + s K + v K K
-        r00, r11, r22 = 1 - v * (b * b + c * c), 1 - v * (a * a + c * c), 1 - v * (a * a + b * b)
-        r01, r10 = v * a * b - s * c, v * a * b + s * c
-        r02, r20 = v * a * c + s * b, v * a * c - s * b
-        r12, r21 = v * b * c - s * a, v * b * c + s * a
+        s, c = math.sin(x), math.cos(x)
         for i in range(3):
-            x0, x1, x2 = before[i, 0], before[i, 1], before[i, 2]
-            out[j, i, 0] = x0 * r00 + x1 * r10 + x2 * r20
-            out[j, i, 1] = x0 * r01 + x1 * r11 + x2 * r21
-            out[j, i, 2] = x0 * r02 + x1 * r12 + x2 * r22
-            out[j, i, 3] = before[i, 3]
+            a, b = T[i, 0], T[i, 1]
+            T[i, 0], T[i, 1] = c * a + s * b, c * b - s * a
 
 
 @compiled
@@ -116,11 +113,8 @@ def tcp_jacobian(tree: KinematicTree, joints: F64, T: F64, out: F64) -> None:
     out[:] = 0.0
     j = tree.frame_joint[-1]
     while j >= 0:
-        a, b, c = tree.axis[j, 0], tree.axis[j, 1], tree.axis[j, 2]
         P = joints[j]
-        ax = P[0, 0] * a + P[0, 1] * b + P[0, 2] * c
-        ay = P[1, 0] * a + P[1, 1] * b + P[1, 2] * c
-        az = P[2, 0] * a + P[2, 1] * b + P[2, 2] * c
+        ax, ay, az = P[0, 2], P[1, 2], P[2, 2]
         k, ratio = tree.coordinate[j], tree.ratio[j]
         vx, vy, vz = ax, ay, az
         if not tree.slides[j]:

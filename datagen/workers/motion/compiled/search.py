@@ -19,6 +19,7 @@ from datagen.workers.motion.compiled.contacts import (
     Still,
     hits_itself,
     hits_still,
+    radii_m,
     scratch_of,
     smallest_gap_m,
 )
@@ -41,6 +42,8 @@ _CLEARANCE_POSES = 8
 _SAME = 0.05  # solutions of one pose that differ by less count as one
 _LONGEST_EDGE = 1.0
 _FIRST_LOOK = 8  # stride of the first, coarse check of a long line
+_PORTION = 96  # poses scored together at first; each further portion is as large as all before
+_SHORT = 8  # poses tried to tell a lift that is too far from no solution
 _OFF_LINE_M = 0.002  # between neighbouring points, where coordinates are interpolated
 _FAR_M = 1.0  # larger clearances are not computed
 
@@ -121,7 +124,17 @@ class Work(NamedTuple):
     ik: Any
     body: Scratch
     hand: HandWork
+    own: Scratch
     own_axes: F64  # (K, 3)
+
+
+class Scores(NamedTuple):
+    """Arrays that scoring writes into."""
+
+    pose: F64  # (3, 4)
+    local: F64  # (3, 4)
+    cells: Ints  # (7,)
+    feature: F64  # (8,)
 
 
 class Found(NamedTuple):
@@ -254,12 +267,15 @@ def hand_workspace(parts: int, still: int) -> HandWork:
 def workspace(arm: Arm, hand: Hand, room: Room) -> Work:
     """Arrays for one candidate: no result depends on earlier ones."""
     still, parts = len(room.still.kind), len(hand.zeros)
+    own = scratch_of(len(arm.own.owner), 0)
+    radii_m(arm.own, own.half_m[:, 0])
     return Work(
         np.empty((len(arm.tree.parent), 3, 4)),
         np.empty((len(arm.tree.frame_joint) + 1, 3, 4)),
         ik_workspace(arm.tree),
         scratch_of(len(arm.body.owner), still),
         hand_workspace(parts, still),
+        own,
         np.zeros((len(arm.own_pairs), 3)),
     )
 
@@ -293,7 +309,7 @@ def is_blocked(
         parts = _hand_parts(hand, opening)
         if hits_still(parts, w.hand.frame, room.still, rows, ignored, limits.margin_m, w.hand.whole):
             return True
-    return hits_itself(arm.own, arm.own_pairs, w.frames, w.own_axes, w.body)
+    return hits_itself(arm.own, arm.own_pairs, w.frames, w.own_axes, w.own)
 
 
 @compiled
@@ -816,24 +832,45 @@ def _compose(A: F64, B: F64, out: F64) -> None:
 
 
 @compiled
-def _scores(arm: Arm, limits: Limits, base: Base, T: F64) -> tuple[F64, F64]:
-    """For each pose (K, 3, 4): samples near grasp and pregrasp, the fewer of both; and with the lifted pose too."""
-    reached, lifted = np.empty(len(T)), np.empty(len(T))
-    pose, local, cells, feature = np.empty((3, 4)), np.empty((3, 4)), np.empty(7, np.int64), np.empty(8)
-    for k in range(len(T)):
-        _inverse_times(base.T_root, T[k], local)
-        n = score(arm.reach, local, cells, feature)
-        if n > 0:
-            _moved(T[k], limits.pregrasp_m, 0.0, pose)
-            _inverse_times(base.T_root, pose, local)
-            n = min(n, score(arm.reach, local, cells, feature))
-        reached[k] = n
-        if n > 0:
-            _moved(T[k], 0.0, limits.lift_m, pose)
-            _inverse_times(base.T_root, pose, local)
-            n = min(n, score(arm.reach, local, cells, feature))
-        lifted[k] = n
-    return reached, lifted
+def _score(arm: Arm, limits: Limits, base: Base, T: F64, s: Scores) -> tuple[int, int]:
+    """Samples near a pose (3, 4) of the hand and its pregrasp, the fewer of both; and with the lifted pose too."""
+    _inverse_times(base.T_root, T, s.local)
+    n = score(arm.reach, s.local, s.cells, s.feature)
+    if n == 0:
+        return 0, 0
+    _moved(T, limits.pregrasp_m, 0.0, s.pose)
+    _inverse_times(base.T_root, s.pose, s.local)
+    n = min(n, score(arm.reach, s.local, s.cells, s.feature))
+    if n == 0:
+        return 0, 0
+    _moved(T, 0.0, limits.lift_m, s.pose)
+    _inverse_times(base.T_root, s.pose, s.local)
+    return n, min(n, score(arm.reach, s.local, s.cells, s.feature))
+
+
+@compiled
+def _try(
+    arm: Arm,
+    hand: Hand,
+    room: Room,
+    limits: Limits,
+    base: Base,
+    poses: Poses,
+    k: int,
+    tried: int,
+    found: Found,
+    w: Work,
+) -> Plan:
+    """Try pose `k`: the stage it leads to, with a whole plan where that is `SUCCESS`."""
+    if not _free(hand, room, limits, poses, k, w.hand):
+        return _no_plan(arm, NO_IK, tried)
+    T, opening = poses.T_world_tcp[k], poses.opening[k]
+    stage, home = _try_pose(arm, hand, room, limits, base, k, T, opening, True, w, found)
+    if stage != SUCCESS:
+        return _no_plan(arm, stage, tried + 1)
+    q_reach = _straight(arm, arm.homes[home], found.q_pregrasp, limits.step)
+    asks = poses.holds[k] == 0
+    return _whole(arm, hand, room, limits, base, tried + 1, k, opening, home, q_reach, found, asks, w)
 
 
 @compiled
@@ -843,6 +880,7 @@ def search(
     room: Room,
     limits: Limits,
     poses: Poses,
+    first: int,
     T_root: F64,
     reach_m: float,
     shoulder_m: F64,
@@ -863,33 +901,34 @@ def search(
         np.empty((points_on(limits.pregrasp_m, limits.line_step_m), count)),
         np.empty((points_on(limits.lift_m, limits.line_step_m), count)),
     )  # fmt: skip
-    reached, lifted = _scores(arm, limits, base, poses.T_world_tcp)
-    stages = np.full(len(reached), -1, np.int8)
-    furthest, tried = NO_IK, 0
-    for is_liftable in (True, False):
-        order = np.argsort(-(lifted if is_liftable else reached), kind="mergesort")
-        for k in order:
-            if (lifted[k] == 0 and is_liftable) or reached[k] == 0 or tried >= limits.tries:
+    scores = Scores(np.empty((3, 4)), np.empty((3, 4)), np.empty(7, np.int64), np.empty(8))
+    stages, order = np.full(len(poses.opening), -1, np.int8), np.empty(len(poses.opening), np.int64)
+    short, shorts = np.empty(_SHORT, np.int64), 0  # poses from which the arm is too short to lift
+    furthest, tried, start, end = NO_IK, 0, 0, max(first, _PORTION)
+    while start < len(order) and tried < limits.tries:
+        end = min(end, len(order))
+        some = np.zeros(end - start)
+        for k in range(start, end):
+            if poses.holds[k] >= 0:
+                reached, lifted = _score(arm, limits, base, poses.T_world_tcp[k], scores)
+                some[k - start] = -lifted
+                if lifted == 0 and reached > 0 and shorts < _SHORT:
+                    short[shorts] = k
+                    shorts += 1
+        for k in np.argsort(some, kind="mergesort"):
+            if some[k] == 0 or tried >= limits.tries:
                 break
-            # A pose that cannot be lifted gets no further than that.
-            if not is_liftable and (lifted[k] > 0 or furthest >= NO_LIFT):
-                continue
-            if poses.holds[k] < 0 or not _free(hand, room, limits, poses, k, w.hand):
-                continue
-            tried += 1
-            stage, home = _try_pose(
-                arm, hand, room, limits, base, k, poses.T_world_tcp[k], poses.opening[k], True, w, found
-            )
-            stages[k] = stage
-            furthest = max(furthest, stage)
-            if stage == NO_START:
-                return _no_plan(arm, stage, tried)
-            if stage == SUCCESS:
-                q_reach = _straight(arm, arm.homes[home], found.q_pregrasp, limits.step)
-                asks = poses.holds[k] == 0
-                return _whole(
-                    arm, hand, room, limits, base, tried, k, poses.opening[k], home, q_reach, found, asks, w
-                )
+            plan = _try(arm, hand, room, limits, base, poses, start + k, tried, found, w)
+            tried = plan.tried
+            stages[start + k] = plan.stage
+            furthest = max(furthest, plan.stage)
+            if plan.stage == SUCCESS or plan.stage == NO_START:
+                return plan
+        start, end = end, 2 * end
+    for k in short[:shorts]:
+        # They get no further than the lift.
+        if furthest < NO_LIFT:
+            furthest = max(furthest, _try(arm, hand, room, limits, base, poses, k, tried, found, w).stage)
     plan = _search_paths(arm, hand, room, limits, base, poses, tried, furthest, found, w, rng)
     if plan.stage == SUCCESS or rounds == 0 or base.counts[1] or len(stages) == 0:
         return plan
