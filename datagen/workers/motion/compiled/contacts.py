@@ -370,27 +370,41 @@ def hits_itself(parts: Parts, pairs: Ints, T: F64, axes: F64, s: Scratch) -> boo
 
 @compiled
 def smallest_gap_m(
-    parts: Parts, T: F64, still: Still, rows: Ints, ignored: int, far_m: float, s: Scratch
+    parts: Parts, T: F64, still: Still, rows: Ints, nearest_only: bool, far_m: float, s: Scratch
 ) -> float:
-    """The smallest distance of the parts to the still ones, at most `far_m`; as `hits_still`."""
-    best = far_m
+    """The smallest distance of the parts, posed by T (O, 3, 4), to the still ones of `rows`, at most `far_m`.
+
+    With `nearest_only` the distance of the two parts whose boxes are nearest: an upper bound.
+    """
+    best, bound = far_m, far_m * far_m
+    one, other = -1, -1
     _boxes(parts, T, 0.0, s)
     for p in range(len(parts.owner)):
-        M, center, half = T[parts.owner[p]], s.center_m[p], s.half_m[p]
-        A = parts.points_m[parts.first[p] : parts.first[p + 1]]
+        center, half = s.center_m[p], s.half_m[p]
         for n in range(len(rows)):
             f = rows[n]
-            if still.kind[f] & (ignored | parts.touches[p]):
+            if still.kind[f] & parts.touches[p]:
                 continue
             squared = 0.0
             for i in range(3):
                 apart = max(still.low_m[f, i] - center[i], center[i] - still.high_m[f, i]) - half[i]
                 squared += max(apart, 0.0) ** 2
-            if squared >= best * best:
-                continue
-            B = still.points_m[still.first[f] : still.first[f + 1]]
-            best = min(best, gap_m(A, M, B, 0.0, best, s.axes[p, f], s.W, s.v))
+            if squared < bound:
+                if nearest_only:
+                    bound, one, other = squared, p, f
+                else:
+                    best = min(best, _gap_of(parts, T, still, p, f, best, s))
+                    bound = best * best
+    if one >= 0:
+        best = min(best, _gap_of(parts, T, still, one, other, best, s))
     return best
+
+
+@compiled
+def _gap_of(parts: Parts, T: F64, still: Still, p: int, f: int, far_m: float, s: Scratch) -> float:
+    A = parts.points_m[parts.first[p] : parts.first[p + 1]]
+    B = still.points_m[still.first[f] : still.first[f + 1]]
+    return gap_m(A, T[parts.owner[p]], B, 0.0, far_m, s.axes[p, f], s.W, s.v)
 
 
 @compiled

@@ -772,13 +772,18 @@ def _whole(
     w: Work,
 ) -> Plan:
     clearance_m, some = _FAR_M, min(_CLEARANCE_POSES, len(q_reach))
-    for k in range(some):
-        q = q_reach[int(round(k * (len(q_reach) - 1) / max(some - 1, 1)))]
-        _pose_arm(arm, base.T_root, q, w)
-        w.hand.frame[0] = w.frames[-2]
-        parts = _hand_parts(hand, opening)
-        clearance_m = smallest_gap_m(parts, w.hand.frame, room.still, base.rows, 0, clearance_m, w.hand.whole)
-        clearance_m = smallest_gap_m(arm.body, w.frames, room.still, base.rows, 0, clearance_m, w.body)
+    parts = _hand_parts(hand, opening)
+    for look in range(2):  # first the parts whose boxes are nearest: then few others need a distance
+        for k in range(some):
+            q = q_reach[int(round(k * (len(q_reach) - 1) / max(some - 1, 1)))]
+            _pose_arm(arm, base.T_root, q, w)
+            w.hand.frame[0] = w.frames[-2]
+            clearance_m = smallest_gap_m(
+                parts, w.hand.frame, room.still, base.rows, look == 0, clearance_m, w.hand.whole
+            )
+            clearance_m = smallest_gap_m(
+                arm.body, w.frames, room.still, base.rows, look == 0, clearance_m, w.body
+            )
     return Plan(
         SUCCESS, tried, row, found.T.copy(), opening, home, q_reach, found.back[::-1].copy(), found.lift.copy(),
         clearance_m, asks,
@@ -861,9 +866,7 @@ def _try(
     found: Found,
     w: Work,
 ) -> Plan:
-    """Try pose `k`: the stage it leads to, with a whole plan where that is `SUCCESS`."""
-    if not _free(hand, room, limits, poses, k, w.hand):
-        return _no_plan(arm, NO_IK, tried)
+    """Try the free pose `k`: the stage it leads to, with a whole plan where that is `SUCCESS`."""
     T, opening = poses.T_world_tcp[k], poses.opening[k]
     stage, home = _try_pose(arm, hand, room, limits, base, k, T, opening, True, w, found)
     if stage != SUCCESS:
@@ -909,7 +912,7 @@ def search(
         end = min(end, len(order))
         some = np.zeros(end - start)
         for k in range(start, end):
-            if poses.holds[k] >= 0:
+            if poses.holds[k] >= 0 and _free(hand, room, limits, poses, k, w.hand):
                 reached, lifted = _score(arm, limits, base, poses.T_world_tcp[k], scores)
                 some[k - start] = -lifted
                 if lifted == 0 and reached > 0 and shorts < _SHORT:
