@@ -7,6 +7,7 @@ import copy
 import numpy as np
 
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse
 from datagen.workers.motion import MotionPlan, PlanReport
 from datagen.workers.motion.compiled.search import SUCCESS, Plan, search
 from datagen.workers.motion.planning_scene import ROOM_AROUND_M, PlanningScene
@@ -58,7 +59,9 @@ def _score(prepared: PlanningScene, plan: Plan) -> float:
     around = prepared.around
     if plan.pose >= 0:
         return around.grasps.score_of(int(around.grasp[plan.pose]))
-    raise NotImplementedError
+    T_object_tcp = inverse(around.T_world_target) @ np.concatenate([plan.T_world_tcp, [[0, 0, 0, 1]]])
+    assert around.grasps.pose_score is not None
+    return around.grasps.pose_score(T_object_tcp, float(around.opening_m[plan.opening]))
 
 
 def _motion_plan(prepared: PlanningScene, plan: Plan, score: float) -> MotionPlan:

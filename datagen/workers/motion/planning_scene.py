@@ -56,6 +56,7 @@ class HandScene:
     GraspSet at which the hand clears the target, each as it is and turned by half a turn about its approach.
     """
 
+    T_world_target: F64  # (4, 4)
     room: Room
     hand: Hand
     grasps: GraspSet
@@ -162,7 +163,7 @@ def hand_scene(
         free_poses(hand, room, limits, poses, first, len(grasp))
     free = len(np.unique(grasp[poses.is_free > 0]))
     opening_m = np.append(np.unique(grasps.opening_m.astype(np.float64)), gripper.max_opening_m)
-    return HandScene(room, hand, grasps, grasp, poses, first, free, opening_m)
+    return HandScene(T_world_target, room, hand, grasps, grasp, poses, first, free, opening_m)
 
 
 _clear: WeakKeyDictionary[GraspSet, dict[tuple[str, Limits], tuple[Hand, Ints, F64, Ints]]] = (

@@ -44,6 +44,13 @@ _LONGEST_EDGE = 1.0
 _FIRST_LOOK = 8  # stride of the first, coarse check of a long line
 _PORTION = 96  # poses scored together at first; each further portion is as large as all before
 _SHORT = 8  # poses tried to tell a lift that is too far from no solution
+# The search near poses: poses in one round, the most that they are near, and those for which IK is tried.
+_NEARBY, _ORIGINS, _NEARBY_TRIED = 480, 24, 48
+_TURN_STD_RAD = math.radians(20)  # about the closing axis
+# About the pads' width and about the approach, in each round and in all: within the contacts' friction cone.
+_TILT_STD_RAD, _MOST_TILT_RAD = math.radians(3), math.radians(8)
+# Along the pads' width and along the approach: less than half a pad.
+_SHIFT_STD_M, _MOST_SHIFT_M = 0.003, 0.006
 _OFF_LINE_M = 0.002  # between neighbouring points, where coordinates are interpolated
 _FAR_M = 1.0  # larger clearances are not computed
 
@@ -655,14 +662,12 @@ def _try_pose(
     row: int,
     T: F64,
     opening: int,
-    holds: bool,
     w: Work,
     found: Found,
 ) -> tuple[int, int]:
     """The furthest stage that a free pose of the hand (3, 4) leads to, and the tucked pose it is reached from.
 
-    Cheap checks come first; `found` gets the lines of a success. Where `holds` is false, a grasp with a straight
-    path counts as none.
+    Cheap checks come first; `found` gets the lines of a success.
     """
     count, stage, home = len(arm.weight), NO_IK, -1
     T_root, rows = base.T_root, base.rows
@@ -727,8 +732,6 @@ def _try_pose(
         ):
             continue
         stage = max(stage, NO_PATH)
-        if not holds:
-            return stage, home
         order = _homes_by_distance(arm, base, found.q_pregrasp)
         for h in order[:_STARTS]:
             if base.homes[h] > 0 and is_line_free(
@@ -868,7 +871,7 @@ def _try(
 ) -> Plan:
     """Try the free pose `k`: the stage it leads to, with a whole plan where that is `SUCCESS`."""
     T, opening = poses.T_world_tcp[k], poses.opening[k]
-    stage, home = _try_pose(arm, hand, room, limits, base, k, T, opening, True, w, found)
+    stage, home = _try_pose(arm, hand, room, limits, base, k, T, opening, w, found)
     if stage != SUCCESS:
         return _no_plan(arm, stage, tried + 1)
     q_reach = _straight(arm, arm.homes[home], found.q_pregrasp, limits.step)
@@ -933,9 +936,137 @@ def search(
         if furthest < NO_LIFT:
             furthest = max(furthest, _try(arm, hand, room, limits, base, poses, k, tried, found, w).stage)
     plan = _search_paths(arm, hand, room, limits, base, poses, tried, furthest, found, w, rng)
-    if plan.stage == SUCCESS or rounds == 0 or base.counts[1] or len(stages) == 0:
+    if plan.stage == SUCCESS or furthest < NO_APPROACH:
         return plan
-    return plan
+    near = _Near(
+        np.empty((_ORIGINS, 3, 4)),
+        np.empty(_ORIGINS, np.int64),
+        np.zeros((_ORIGINS, 5)),
+        np.zeros(1, np.int64),
+    )
+    best = np.argsort(-stages, kind="mergesort")
+    for k in best[:_ORIGINS]:
+        if stages[k] < 0:
+            break
+        m = near.count[0]
+        near.T[m], near.opening[m] = poses.T_world_tcp[k], poses.opening[k]
+        near.count[0] += 1
+    for _ in range(rounds):
+        base.counts[0] = 0
+        plan, skips = _search_near(
+            arm, hand, room, limits, base, poses, near, tried, furthest, skips, found, scores, w, rng
+        )
+        tried, furthest = plan.tried, max(furthest, plan.stage)
+        if plan.stage == SUCCESS or near.count[0] == 0:
+            return plan
+    return _no_plan(arm, furthest, tried)
+
+
+class _Near(NamedTuple):
+    """Poses that a round of the search near them begins with: a grasp and a motion in its frame."""
+
+    T: F64  # (N, 3, 4), grasps, world
+    opening: Ints  # (N,)
+    # (N, 5): turn about y, the closing axis; tilts about x and z; shifts along x and z
+    motion: F64
+    count: Ints  # (1,), how many are filled
+
+
+@compiled
+def _varied(T: F64, motion: F64, rng: np.random.Generator, new: F64, out: F64) -> None:
+    """A random motion near another one, (5,), and the grasp (3, 4) moved by it.
+
+    Both fingers keep their contacts, so that most of these poses hold the object as the grasp does.
+    """
+    new[0] = motion[0] + _TURN_STD_RAD * rng.standard_normal()
+    for k in range(1, 3):
+        tilt = motion[k] + _TILT_STD_RAD * rng.standard_normal()
+        new[k] = min(max(tilt, -_MOST_TILT_RAD), _MOST_TILT_RAD)
+    for k in range(3, 5):
+        shift = motion[k] + _SHIFT_STD_M * rng.standard_normal()
+        new[k] = min(max(shift, -_MOST_SHIFT_M), _MOST_SHIFT_M)
+    for i in range(3):
+        out[i] = T[i]
+        out[i, 3] += T[i, 0] * new[3] + T[i, 2] * new[4]
+    for axis, angle in ((1, new[0]), (0, new[1]), (2, new[2])):
+        c, s = math.cos(angle), math.sin(angle)
+        a, b = (axis + 1) % 3, (axis + 2) % 3
+        for i in range(3):
+            x, y = out[i, a], out[i, b]
+            out[i, a], out[i, b] = c * x + s * y, c * y - s * x
+
+
+@compiled
+def _search_near(
+    arm: Arm,
+    hand: Hand,
+    room: Room,
+    limits: Limits,
+    base: Base,
+    poses: Poses,
+    near: _Near,
+    tried: int,
+    furthest: int,
+    skips: int,
+    found: Found,
+    scores: Scores,
+    w: Work,
+    rng: np.random.Generator,
+) -> tuple[Plan, int]:
+    """One round of the search near poses: `near` then has the best of those tried. Also the skips left."""
+    n = near.count[0]
+    each = _NEARBY // n
+    T, motion = np.empty((n * each, 3, 4)), np.empty((n * each, 5))
+    some, opening = np.zeros(n * each), np.empty(n * each, np.int64)
+    origin = np.empty(n * each, np.int64)
+    for k in range(n * each):
+        origin[k], opening[k] = k // each, near.opening[k // each]
+        _varied(near.T[origin[k]], near.motion[origin[k]], rng, motion[k], T[k])
+        _, lifted = _score(arm, limits, base, T[k], scores)
+        if (
+            lifted > 0
+            and is_hand_free(hand, room, limits, T[k], opening[k], w.hand)
+            and clears_target(hand, room, limits, T[k], opening[k], w.hand)
+        ):
+            some[k] = -lifted
+    stages = np.full(n * each, -1, np.int8)
+    left = _NEARBY_TRIED
+    for k in np.argsort(some, kind="mergesort"):
+        if some[k] == 0 or left == 0:
+            break
+        left -= 1
+        tried += 1
+        stage, home = _try_pose(arm, hand, room, limits, base, -1, T[k], opening[k], w, found)
+        if stage == SUCCESS and skips > 0:
+            skips -= 1
+            continue
+        stages[k] = stage
+        furthest = max(furthest, stage)
+        if stage == SUCCESS:
+            q_reach = _straight(arm, arm.homes[home], found.q_pregrasp, limits.step)
+            whole = _whole(
+                arm, hand, room, limits, base, tried, -1, opening[k], home, q_reach, found, True, w
+            )
+            return whole, skips
+    if skips == 0:
+        plan = _search_paths(arm, hand, room, limits, base, poses, tried, furthest, found, w, rng)
+        if plan.stage == SUCCESS:
+            return plan, skips
+    best, rows = np.argsort(-stages, kind="mergesort"), 0
+    next_T, next_motion = np.empty((_ORIGINS, 3, 4)), np.empty((_ORIGINS, 5))
+    next_opening = np.empty(_ORIGINS, np.int64)
+    for k in best[:_ORIGINS]:
+        if stages[k] < ARM_COLLISION:
+            break
+        next_T[rows], next_motion[rows], next_opening[rows] = near.T[origin[k]], motion[k], opening[k]
+        rows += 1
+    near.T[:rows], near.motion[:rows], near.opening[:rows] = (
+        next_T[:rows],
+        next_motion[:rows],
+        next_opening[:rows],
+    )
+    near.count[0] = rows
+    return _no_plan(arm, furthest, tried), skips
 
 
 @compiled
