@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from datagen.workers.geometry.mesh import F32, F64, I32
+from datagen.workers.motion.compiled.compiler import in_memory
 from datagen.workers.motion.compiled.contacts import Parts
 from datagen.workers.motion.compiled.reach_map import AZIMUTHS, CELLS, ReachMap, fill
 from datagen.workers.motion.compiled.search import FLOOR, Arm, Hand
@@ -130,7 +131,14 @@ def hand_of(gripper: Gripper, opening_m: F64) -> Hand:
     bodies = [[*gripper.palm_parts_m, *left, *right] for left, right in gripper.fingers_in]
     whole = _slid([list(map(_f64, parts)) for parts in bodies], sides, posture, opening_m)
     core = _slid([list(map(core_of, parts)) for parts in bodies], sides, posture, opening_m)
-    return Hand(whole[0], *whole[2:], core[0], *core[2:], whole[1], core[1], np.zeros(len(sides), np.int64))
+    return Hand(_shapes(*whole), _shapes(*core))
+
+
+def _shapes(points: F64, first: Ints, center: F64, half: F64) -> Parts:
+    """Parts with one shape an opening (N,), all of one owner."""
+    zeros = np.zeros(len(first) - 1, np.int64)
+    flat = [a.reshape(-1, 3) for a in (points, center, half)]
+    return Parts(flat[0], first, zeros, flat[1], flat[2], zeros)
 
 
 def _f64(part: F32) -> F64:
@@ -243,9 +251,9 @@ def _samples(
         1.0,
     )
     some = q[:_FIRST_SAMPLES].copy()
-    fill(reach, tree, some, cell[: len(some)], features)
+    fill(in_memory(reach), in_memory(tree), some, cell[: len(some)], features)
     half = 1.02 * float(np.abs(features[: len(some), :2]).max())
-    fill(reach._replace(half_m=half), tree, q, cell, features)
+    fill(in_memory(reach._replace(half_m=half)), in_memory(tree), q, cell, features)
     order = np.argsort(cell, kind="stable")
     count = CELLS if turn >= 0 else CELLS * AZIMUTHS
     first = np.searchsorted(cell[order], np.arange(count + 1)).astype(np.int32)

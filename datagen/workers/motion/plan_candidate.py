@@ -9,6 +9,7 @@ import numpy as np
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.motion import MotionPlan, PlanReport
+from datagen.workers.motion.compiled.compiler import in_memory
 from datagen.workers.motion.compiled.search import SUCCESS, Plan, search
 from datagen.workers.motion.planning_scene import ROOM_AROUND_M, PlanningScene
 
@@ -65,21 +66,12 @@ def _score(prepared: PlanningScene, plan: Plan) -> float:
 
 
 def _motion_plan(prepared: PlanningScene, plan: Plan, score: float) -> MotionPlan:
-    around, weight = prepared.around, prepared.arm.weight
+    around = prepared.around
     if plan.pose >= 0:
         around.poses.holds[plan.pose] = 1
-    ways = (plan.q_reach, plan.q_approach)
-    length = sum(float(np.linalg.norm(np.diff(q, axis=0) * weight, axis=1).sum()) for q in ways)
     grasp = int(around.grasp[plan.pose]) if plan.pose >= 0 else -1
     opening_m = float(around.opening_m[plan.opening])
     return MotionPlan(
-        grasp,
-        plan.home,
-        plan.q_reach,
-        plan.q_approach,
-        plan.q_lift,
-        opening_m,
-        length,
-        plan.clearance_m,
+        grasp, plan.home, plan.q_reach, plan.q_approach, plan.q_lift, opening_m, plan.length, plan.clearance_m,
         score,
-    )
+    )  # fmt: skip

@@ -14,6 +14,7 @@ from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.grasps.grasp_cache import GraspSet
 from datagen.workers.houses.house import House
 from datagen.workers.motion.arm_model import TOUCH_M, arm_of, core_of, hand_of, on_pedestal, parts_of
+from datagen.workers.motion.compiled.compiler import in_memory
 from datagen.workers.motion.compiled.contacts import Parts, Still, hit_any
 from datagen.workers.motion.compiled.search import (
     FLOOR,
@@ -105,7 +106,7 @@ def prepare(
     key = (robot.gripper.digest, grasps, params, per_scene, around_m)
     if key not in known:
         known[key] = hand_scene(scene, robot.gripper, grasps, limits, per_scene, around_m)
-    return PlanningScene(robot, params, limits, arm, known[key])
+    return PlanningScene(robot, params, in_memory(limits), in_memory(arm), known[key])
 
 
 # By scene, for as long as it lives. The key holds the GraspSet, so that its id is not used again.
@@ -147,20 +148,21 @@ def hand_scene(
     center, room_m = scene.target_center_m, _HAND_ROOM_M + max(limits.pregrasp_m, limits.lift_m)
     near = (still.low_m < center + room_m) & (still.high_m > center - room_m)
     near[len(static) :] = True
-    room = Room(still, np.flatnonzero(near.all(axis=1)))
+    room = in_memory(Room(still, np.flatnonzero(near.all(axis=1))))
     hand, grasp, T_object_tcp, opening = _clear_poses(gripper, grasps, target, limits)
     first = int(np.searchsorted(grasp, per_scene))
     of_others = np.arange(len(static) + len(objects[0]), len(still.kind))
     of_static = np.flatnonzero(near.all(axis=1)[: len(static)])
-    if _is_sunk(target, T_world_target, still, of_others) or not _can_be_lifted(
-        target, T_world_target, still, of_static, limits.lift_m
+    if _is_sunk(target, T_world_target, in_memory(still), of_others) or not _can_be_lifted(
+        target, T_world_target, in_memory(still), of_static, limits.lift_m
     ):
         grasp, T_object_tcp, opening, first = grasp[:0], T_object_tcp[:0], opening[:0], 0
     T_world_tcp = np.ascontiguousarray(np.matmul(T_world_target, T_object_tcp)[:, :3])
     holds = np.array([1 if k < len(grasps.score) else 0 for k in grasp.tolist()], np.int8)
     poses = Poses(T_world_tcp, opening, np.ones(len(grasp), np.int8), np.zeros(len(grasp), np.int8), holds)
-    if free_poses(hand, room, limits, poses, 0, first) == 0:
-        free_poses(hand, room, limits, poses, first, len(grasp))
+    checked = (hand, room, in_memory(limits), in_memory(poses))
+    if free_poses(*checked, 0, first) == 0:
+        free_poses(*checked, first, len(grasp))
     free = len(np.unique(grasp[poses.is_free > 0]))
     opening_m = np.append(np.unique(grasps.opening_m.astype(np.float64)), gripper.max_opening_m)
     return HandScene(T_world_target, room, hand, grasps, grasp, poses, first, free, opening_m)
@@ -181,14 +183,14 @@ def _clear_poses(
     known, key = _clear.setdefault(grasps, {}), (gripper.digest, limits)
     if key not in known:
         opening_m, rows = np.unique(grasps.opening_m.astype(np.float64), return_inverse=True)
-        hand = hand_of(gripper, opening_m)
+        hand = in_memory(hand_of(gripper, opening_m))
         grasp = np.repeat(np.arange(len(grasps)), 2)
         T = np.repeat(grasps.T_object_tcp, 2, axis=0)
         T[1::2] = T[1::2] @ _HALF_TURN
         still = still_of(target.convex_parts_m, [TARGET] * len(target.convex_parts_m))
         opening = rows[grasp].astype(np.int64)
-        room = Room(still, np.arange(len(still.kind)))
-        ok = clear_poses(hand, room, limits, np.ascontiguousarray(T[:, :3]), opening)
+        room = in_memory(Room(still, np.arange(len(still.kind))))
+        ok = clear_poses(hand, room, in_memory(limits), np.ascontiguousarray(T[:, :3]), opening)
         known[key] = (hand, grasp[ok], T[ok], opening[ok])
     return known[key]
 
@@ -200,7 +202,7 @@ def _core(model: ObjectModel, depth_m: float) -> Parts:
     """What lies deeper than `depth_m` in an object's parts; computed once for as long as the model lives."""
     known = _cores.setdefault(model, {})
     if depth_m not in known:
-        known[depth_m] = parts_of([[core_of(part, depth_m) for part in model.convex_parts_m]])
+        known[depth_m] = in_memory(parts_of([[core_of(part, depth_m) for part in model.convex_parts_m]]))
     return known[depth_m]
 
 

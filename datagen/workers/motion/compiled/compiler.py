@@ -2,14 +2,43 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
+from numba.core import types
+from numba.experimental import structref
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+_Tuple = TypeVar("_Tuple", bound=NamedTuple)
 
 
 def compiled(function: _Function) -> _Function:
     """The function as machine code. Without fast-math: equal arguments give equal bits on one platform."""
     return numba.njit(cache=True, error_model="numpy")(function)
+
+
+def struct(fields: type[_Tuple]) -> type[_Tuple]:
+    """A structure in memory with the fields of a NamedTuple, as machine code takes it: one pointer.
+
+    A tuple of arrays would be passed as all their sizes and strides, which compiles and runs many times slower.
+    """
+    name = f"{fields.__name__}Struct"
+    own = {"__module__": fields.__module__, "__doc__": fields.__doc__}
+    kind = structref.register(type(f"{name}Type", (types.StructRef,), own))
+    # Caches name types by their module.
+    setattr(sys.modules[fields.__module__], kind.__name__, kind)
+    made = type(name, (structref.StructRefProxy,), own)
+    structref.define_proxy(made, kind, list(fields._fields))
+    _structs[fields] = made
+    return cast("type[_Tuple]", made)
+
+
+_structs: dict[type, Any] = {}
+
+
+def in_memory(value: _Tuple) -> _Tuple:
+    """The structure of a tuple's fields, which shares its arrays; fields that are such tuples become structures."""
+    made = [in_memory(field) if type(field) in _structs else field for field in value]  # pyright: ignore
+    return _structs[type(value)](*made)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.motion.compiled.compiler import compiled
+from datagen.workers.motion.compiled.compiler import compiled, struct
 from datagen.workers.robots.kinematic_tree import Ints
 
 _MAX_STEPS = 100
@@ -21,14 +21,17 @@ _TOUCHING = 1e-20  # squared distance (m^2) that counts as none
 
 
 class Parts(NamedTuple):
-    """P convex parts; boxes along the axes of their owners' frames."""
+    """P convex parts in S shapes, one after the other; boxes along the axes of their owners' frames."""
 
-    points_m: F64  # (V, 3), corners of all parts
-    first: Ints  # (P + 1,), rows of each part's corners
+    points_m: F64  # (S * V, 3), corners of all parts
+    first: Ints  # (P + 1,), rows of each part's corners in the first shape
     owner: Ints  # (P,)
-    center_m: F64  # (P, 3)
-    half_m: F64  # (P, 3)
+    center_m: F64  # (S * P, 3)
+    half_m: F64  # (S * P, 3)
     touches: Ints  # (P,), kinds of still parts that each may touch
+
+
+struct(Parts)
 
 
 @compiled
@@ -214,6 +217,9 @@ class Still(NamedTuple):
     kind: Ints  # (F,), bits: what the part belongs to
 
 
+struct(Still)
+
+
 class Scratch(NamedTuple):
     """Arrays that checks of P moving and F still parts write into."""
 
@@ -223,36 +229,43 @@ class Scratch(NamedTuple):
     center_m: F64  # (P, 3), of the moving parts' boxes
     half_m: F64  # (P, 3)
     near: Ints  # (F,)
+    relative: F64  # (3, 4)
+
+
+new_scratch = struct(Scratch)
 
 
 @compiled
 def scratch_of(moving: int, still: int) -> Scratch:
     """Arrays for the checks of so many moving and still parts."""
-    return Scratch(
+    return new_scratch(
         np.empty((4, 3)),
         np.empty(3),
         np.zeros((moving, still, 3)),
         np.empty((moving, 3)),
         np.empty((moving, 3)),
         np.empty(still, np.int64),
+        np.empty((3, 4)),
     )
 
 
 @compiled
 def _boxes(
-    parts: Parts, T: F64, margin_m: float, s: Scratch
+    parts: Parts, shape: int, T: F64, margin_m: float, s: Scratch
 ) -> tuple[float, float, float, float, float, float]:
     """Boxes of the posed parts along the still parts' axes, grown by the margin; returns the box of all."""
     lx = ly = lz = np.inf
     hx = hy = hz = -np.inf
-    for p in range(len(parts.owner)):
-        M, c, h, center, half = (
-            T[parts.owner[p]],
-            parts.center_m[p],
-            parts.half_m[p],
-            s.center_m[p],
-            s.half_m[p],
-        )
+    owner, centers, halves, out_center, out_half = (
+        parts.owner,
+        parts.center_m,
+        parts.half_m,
+        s.center_m,
+        s.half_m,
+    )
+    for p in range(len(owner)):
+        row = shape * len(owner) + p
+        M, c, h, center, half = T[owner[p]], centers[row], halves[row], out_center[p], out_half[p]
         for i in range(3):
             center[i] = M[i, 0] * c[0] + M[i, 1] * c[1] + M[i, 2] * c[2] + M[i, 3]
             half[i] = abs(M[i, 0]) * h[0] + abs(M[i, 1]) * h[1] + abs(M[i, 2]) * h[2] + margin_m
@@ -263,33 +276,47 @@ def _boxes(
 
 
 @compiled
+def _gap_of(
+    parts: Parts, shape: int, T: F64, still: Still, p: int, f: int, near_m: float, far_m: float, s: Scratch
+) -> float:
+    first, rows = parts.first, still.first
+    at = shape * first[-1]
+    A = parts.points_m[at + first[p] : at + first[p + 1]]
+    B = still.points_m[rows[f] : rows[f + 1]]
+    return gap_m(A, T[parts.owner[p]], B, near_m, far_m, s.axes[p, f], s.W, s.v)
+
+
+@compiled
 def hits_still(
-    parts: Parts, T: F64, still: Still, rows: Ints, ignored: int, margin_m: float, s: Scratch
+    parts: Parts, shape: int, T: F64, still: Still, rows: Ints, ignored: int, margin_m: float, s: Scratch
 ) -> bool:
     """Whether a part, its owner posed by T (O, 3, 4), comes within `margin_m` of a still part.
 
     Only still parts of `rows` count, and none with a bit of `ignored`.
     """
-    lx, ly, lz, hx, hy, hz = _boxes(parts, T, margin_m, s)
-    count = 0
+    lx, ly, lz, hx, hy, hz = _boxes(parts, shape, T, margin_m, s)
+    count, lows, highs, kinds, near = 0, still.low_m, still.high_m, still.kind, s.near
     for n in range(len(rows)):
         f = rows[n]
-        low, high = still.low_m[f], still.high_m[f]
+        low, high = lows[f], highs[f]
         is_apart = (
             (lz > high[2]) | (hz < low[2]) | (lx > high[0]) | (hx < low[0]) | (ly > high[1]) | (hy < low[1])
         )
-        s.near[count] = f
-        count += not (is_apart or still.kind[f] & ignored)
-    for p in range(len(parts.owner)):
-        M, h = T[parts.owner[p]], parts.half_m[p]
-        cx, cy, cz = s.center_m[p, 0], s.center_m[p, 1], s.center_m[p, 2]
-        wx, wy, wz = s.half_m[p, 0], s.half_m[p, 1], s.half_m[p, 2]
+        near[count] = f
+        count += not (is_apart or kinds[f] & ignored)
+    if count == 0:
+        return False
+    owner, halves, touches, centers, wides = parts.owner, parts.half_m, parts.touches, s.center_m, s.half_m
+    for p in range(len(owner)):
+        M, h = T[owner[p]], halves[shape * len(owner) + p]
+        cx, cy, cz = centers[p, 0], centers[p, 1], centers[p, 2]
+        wx, wy, wz = wides[p, 0], wides[p, 1], wides[p, 2]
         for n in range(count):
-            f = s.near[n]
-            low, high = still.low_m[f], still.high_m[f]
+            f = near[n]
+            low, high = lows[f], highs[f]
             if cx - wx > high[0] or cx + wx < low[0] or cy - wy > high[1] or cy + wy < low[1]:
                 continue
-            if cz - wz > high[2] or cz + wz < low[2] or still.kind[f] & parts.touches[p]:
+            if cz - wz > high[2] or cz + wz < low[2] or kinds[f] & touches[p]:
                 continue
             # The still box along the moving part's own axes: this drops most pairs of long, tilted parts.
             mx, my, mz = (low[0] + high[0]) / 2 - cx, (low[1] + high[1]) / 2 - cy, (low[2] + high[2]) / 2 - cz
@@ -301,9 +328,7 @@ def hits_still(
                 is_apart |= away > size + h[i] + margin_m
             if is_apart:
                 continue
-            A = parts.points_m[parts.first[p] : parts.first[p + 1]]
-            B = still.points_m[still.first[f] : still.first[f + 1]]
-            if gap_m(A, M, B, margin_m, margin_m, s.axes[p, f], s.W, s.v) <= margin_m:
+            if _gap_of(parts, shape, T, still, p, f, margin_m, margin_m, s) <= margin_m:
                 return True
     return False
 
@@ -324,23 +349,24 @@ def hits_itself(parts: Parts, pairs: Ints, T: F64, axes: F64, s: Scratch) -> boo
 
     `axes` is (K, 3). The first column of `s.half_m` has the parts' radii around their boxes' centres.
     """
-    M = np.empty((3, 4))
-    for p in range(len(parts.owner)):
-        N, c = T[parts.owner[p]], parts.center_m[p]
+    M, owner, centers, halves = s.relative, parts.owner, parts.center_m, parts.half_m
+    points, first, placed, radii = parts.points_m, parts.first, s.center_m, s.half_m
+    for p in range(len(owner)):
+        N, c = T[owner[p]], centers[p]
         for i in range(3):
-            s.center_m[p, i] = N[i, 0] * c[0] + N[i, 1] * c[1] + N[i, 2] * c[2] + N[i, 3]
+            placed[p, i] = N[i, 0] * c[0] + N[i, 1] * c[1] + N[i, 2] * c[2] + N[i, 3]
     for k in range(len(pairs)):
         a, b = pairs[k, 0], pairs[k, 1]
         x, y, z = (
-            s.center_m[a, 0] - s.center_m[b, 0],
-            s.center_m[a, 1] - s.center_m[b, 1],
-            s.center_m[a, 2] - s.center_m[b, 2],
+            placed[a, 0] - placed[b, 0],
+            placed[a, 1] - placed[b, 1],
+            placed[a, 2] - placed[b, 2],
         )
-        reach = s.half_m[a, 0] + s.half_m[b, 0]
+        reach = radii[a, 0] + radii[b, 0]
         if x * x + y * y + z * z > reach * reach:
             continue
-        _relative(T[parts.owner[a]], T[parts.owner[b]], M)
-        c, h, low, half = parts.center_m[a], parts.half_m[a], parts.center_m[b], parts.half_m[b]
+        _relative(T[owner[a]], T[owner[b]], M)
+        c, h, low, half = centers[a], halves[a], centers[b], halves[b]
         is_apart = False
         mx, my, mz = 0.0, 0.0, 0.0
         for i in range(3):
@@ -361,8 +387,8 @@ def hits_itself(parts: Parts, pairs: Ints, T: F64, axes: F64, s: Scratch) -> boo
             is_apart |= away > size + h[i]
         if is_apart:
             continue
-        A = parts.points_m[parts.first[a] : parts.first[a + 1]]
-        B = parts.points_m[parts.first[b] : parts.first[b + 1]]
+        A = points[first[a] : first[a + 1]]
+        B = points[first[b] : first[b + 1]]
         if gap_m(A, M, B, 0.0, 0.0, axes[k], s.W, s.v) <= 0.0:
             return True
     return False
@@ -370,7 +396,7 @@ def hits_itself(parts: Parts, pairs: Ints, T: F64, axes: F64, s: Scratch) -> boo
 
 @compiled
 def smallest_gap_m(
-    parts: Parts, T: F64, still: Still, rows: Ints, nearest_only: bool, far_m: float, s: Scratch
+    parts: Parts, shape: int, T: F64, still: Still, rows: Ints, nearest_only: bool, far_m: float, s: Scratch
 ) -> float:
     """The smallest distance of the parts, posed by T (O, 3, 4), to the still ones of `rows`, at most `far_m`.
 
@@ -378,33 +404,27 @@ def smallest_gap_m(
     """
     best, bound = far_m, far_m * far_m
     one, other = -1, -1
-    _boxes(parts, T, 0.0, s)
+    _boxes(parts, shape, T, 0.0, s)
+    lows, highs, kinds, centers, halves = still.low_m, still.high_m, still.kind, s.center_m, s.half_m
     for p in range(len(parts.owner)):
-        center, half = s.center_m[p], s.half_m[p]
+        center, half = centers[p], halves[p]
         for n in range(len(rows)):
             f = rows[n]
-            if still.kind[f] & parts.touches[p]:
+            if kinds[f] & parts.touches[p]:
                 continue
             squared = 0.0
             for i in range(3):
-                apart = max(still.low_m[f, i] - center[i], center[i] - still.high_m[f, i]) - half[i]
+                apart = max(lows[f, i] - center[i], center[i] - highs[f, i]) - half[i]
                 squared += max(apart, 0.0) ** 2
             if squared < bound:
                 if nearest_only:
                     bound, one, other = squared, p, f
                 else:
-                    best = min(best, _gap_of(parts, T, still, p, f, best, s))
+                    best = min(best, _gap_of(parts, shape, T, still, p, f, 0.0, best, s))
                     bound = best * best
     if one >= 0:
-        best = min(best, _gap_of(parts, T, still, one, other, best, s))
+        best = min(best, _gap_of(parts, shape, T, still, one, other, 0.0, best, s))
     return best
-
-
-@compiled
-def _gap_of(parts: Parts, T: F64, still: Still, p: int, f: int, far_m: float, s: Scratch) -> float:
-    A = parts.points_m[parts.first[p] : parts.first[p + 1]]
-    B = still.points_m[still.first[f] : still.first[f + 1]]
-    return gap_m(A, T[parts.owner[p]], B, 0.0, far_m, s.axes[p, f], s.W, s.v)
 
 
 @compiled
@@ -412,7 +432,7 @@ def hit_any(parts: Parts, T: F64, still: Still, rows: Ints) -> bool:
     """Whether the parts touch a still part of `rows` at any of the poses T (N, O, 3, 4) of their owners."""
     s = scratch_of(len(parts.owner), len(still.kind))
     for k in range(len(T)):
-        if hits_still(parts, T[k], still, rows, 0, 0.0, s):
+        if hits_still(parts, 0, T[k], still, rows, 0, 0.0, s):
             return True
     return False
 

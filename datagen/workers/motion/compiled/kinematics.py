@@ -6,12 +6,12 @@ The joints' axes are z: `KinematicTree.along_z` turns their frames so.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.motion.compiled.compiler import compiled
+from datagen.workers.motion.compiled.compiler import compiled, struct
 from datagen.workers.robots.kinematic_tree import KinematicTree
 
 POSITION_TOLERANCE_M = 0.0005
@@ -23,6 +23,20 @@ _DAMPING_PER_ERROR = 0.003
 # Fails when the best error has not fallen to this share within this number of steps.
 _PATIENCE, _PROGRESS = 8, 0.7
 _SMALL = 1e-10
+
+
+class IkWork(NamedTuple):
+    """Arrays that `solve` writes into."""
+
+    joints: F64  # (J, 3, 4)
+    tcp: F64  # (3, 4)
+    jacobian: F64  # (A, 6)
+    error: F64  # (6,)
+    normal: F64  # (6, 6)
+
+
+new_ik_work = struct(IkWork)
+struct(KinematicTree)
 
 
 @compiled
@@ -147,16 +161,15 @@ def _solve6(H: F64, e: F64) -> None:
 
 
 @compiled
-def solve(tree: KinematicTree, T_root: F64, goal: F64, q: F64, work: Any) -> bool:
+def solve(tree: KinematicTree, T_root: F64, goal: F64, q: F64, work: IkWork) -> bool:
     """Move the coordinates (A,), in place, until the TCP is at the goal (3, 4); whether it is.
 
     Levenberg-Marquardt with damping that grows with the squared error (Sugihara 2011), on the pose error as
     a twist in the TCP's frame; a coordinate at its limit stays there while the step pushes it out. The goal
     is reached within 0.5 mm and 0.5 degrees.
     """
-    joints, T, J = work
-    count = len(q)
-    e, H = np.empty(6), np.empty((6, 6))
+    joints, T, J = work.joints, work.tcp, work.jacobian
+    count, e, H = len(q), work.error, work.normal
     for k in range(count):
         q[k] = min(max(q[k], tree.lower[k]), tree.upper[k])
     best, best_at = np.inf, 0
@@ -197,6 +210,12 @@ def solve(tree: KinematicTree, T_root: F64, goal: F64, q: F64, work: Any) -> boo
 
 
 @compiled
-def ik_workspace(tree: KinematicTree) -> Any:
-    """Arrays that `solve` writes into: poses of the joints and of the TCP, and the Jacobian."""
-    return np.empty((len(tree.parent), 3, 4)), np.empty((3, 4)), np.empty((len(tree.lower), 6))
+def ik_workspace(tree: KinematicTree) -> IkWork:
+    """Arrays for `solve`."""
+    return new_ik_work(
+        np.empty((len(tree.parent), 3, 4)),
+        np.empty((3, 4)),
+        np.empty((len(tree.lower), 6)),
+        np.empty(6),
+        np.empty((6, 6)),
+    )

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from datagen.workers.geometry.mesh import F32, F64, I32
-from datagen.workers.motion.compiled.compiler import compiled
+from datagen.workers.motion.compiled.compiler import compiled, struct
 from datagen.workers.motion.compiled.kinematics import joint_poses, tcp_pose
 from datagen.workers.robots.kinematic_tree import Ints, KinematicTree
 
@@ -32,6 +32,9 @@ class ReachMap(NamedTuple):
     turn: int  # the coordinate that turns about it; -1 where there is none
     tcp_wrist_m: F64  # (3,), TCP frame
     half_m: float  # largest distance and height of the wrist
+
+
+struct(ReachMap)
 
 
 @compiled
@@ -69,9 +72,9 @@ def _feature(reach: ReachMap, T: F64, out: F64) -> float:
 
     Returns the azimuth by which it was turned; the first number is above 1 where the wrist is out of the map.
     """
-    w = reach.tcp_wrist_m
-    x = T[0, 0] * w[0] + T[0, 1] * w[1] + T[0, 2] * w[2] + T[0, 3] - reach.axis_xy_m[0]
-    y = T[1, 0] * w[0] + T[1, 1] * w[1] + T[1, 2] * w[2] + T[1, 3] - reach.axis_xy_m[1]
+    w, axis = reach.tcp_wrist_m, reach.axis_xy_m
+    x = T[0, 0] * w[0] + T[0, 1] * w[1] + T[0, 2] * w[2] + T[0, 3] - axis[0]
+    y = T[1, 0] * w[0] + T[1, 1] * w[1] + T[1, 2] * w[2] + T[1, 3] - axis[1]
     z = T[2, 0] * w[0] + T[2, 1] * w[1] + T[2, 2] * w[2] + T[2, 3]
     azimuth = math.atan2(y, x)
     c, s = math.cos(azimuth), math.sin(azimuth)
@@ -116,10 +119,10 @@ def cells_near(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> float:
 def score(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> int:
     """How many samples lie near a TCP pose (3, 4) in the base frame: those of its own cell count eight times."""
     cells_near(reach, T, cells, feature)
-    total = 0
+    total, first = 0, reach.first
     for k in range(7):
         if cells[k] >= 0:
-            total += (8 if k == 0 else 1) * (reach.first[cells[k] + 1] - reach.first[cells[k]])
+            total += (8 if k == 0 else 1) * (first[cells[k] + 1] - first[cells[k]])
     return total
 
 

@@ -6,13 +6,13 @@ The same checks in the same order for every candidate; all random numbers come f
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.motion.compiled.compiler import compiled
+from datagen.workers.motion.compiled.compiler import compiled, struct
 from datagen.workers.motion.compiled.contacts import (
     Parts,
     Scratch,
@@ -24,6 +24,7 @@ from datagen.workers.motion.compiled.contacts import (
     smallest_gap_m,
 )
 from datagen.workers.motion.compiled.kinematics import (
+    IkWork,
     frame_poses,
     ik_workspace,
     joint_poses,
@@ -68,18 +69,17 @@ class Arm(NamedTuple):
     reach: ReachMap
 
 
-class Hand(NamedTuple):
-    """The hand's parts at O openings in the TCP frame, and their cores, which lie 2 mm inside them."""
+struct(Arm)
 
-    points_m: F64  # (O, V, 3)
-    center_m: F64  # (O, P, 3)
-    half_m: F64  # (O, P, 3)
-    core_points_m: F64  # (O, W, 3)
-    core_center_m: F64  # (O, P, 3)
-    core_half_m: F64  # (O, P, 3)
-    first: Ints  # (P + 1,), rows of each part's corners
-    core_first: Ints  # (P + 1,)
-    zeros: Ints  # (P,)
+
+class Hand(NamedTuple):
+    """The hand in the TCP frame, one shape an opening; the last is fully open."""
+
+    whole: Parts
+    core: Parts  # what lies 2 mm inside the parts
+
+
+struct(Hand)
 
 
 class Poses(NamedTuple):
@@ -90,6 +90,9 @@ class Poses(NamedTuple):
     clears: npt.NDArray[np.int8]  # (K,), the hand clears the target on its approach
     is_free: npt.NDArray[np.int8]  # (K,), and everything else, and can lift the target
     holds: npt.NDArray[np.int8]  # (K,), the hand holds the object
+
+
+struct(Poses)
 
 
 class Limits(NamedTuple):
@@ -108,11 +111,17 @@ class Limits(NamedTuple):
     iterations: int
 
 
+struct(Limits)
+
+
 class Room(NamedTuple):
     """The scene around the target."""
 
     still: Still
     near_target: Ints  # parts that the hand can touch while it grasps and lifts
+
+
+struct(Room)
 
 
 class HandWork(NamedTuple):
@@ -123,16 +132,22 @@ class HandWork(NamedTuple):
     core: Scratch
 
 
+new_hand_work = struct(HandWork)
+
+
 class Work(NamedTuple):
     """Arrays that the search writes into."""
 
     joints: F64  # (J, 3, 4)
     frames: F64  # (F + 1, 3, 4), the last is the base
-    ik: Any
+    ik: IkWork
     body: Scratch
     hand: HandWork
     own: Scratch
     own_axes: F64  # (K, 3)
+
+
+new_work = struct(Work)
 
 
 class Scores(NamedTuple):
@@ -142,6 +157,9 @@ class Scores(NamedTuple):
     local: F64  # (3, 4)
     cells: Ints  # (7,)
     feature: F64  # (8,)
+
+
+new_scores = struct(Scores)
 
 
 class Found(NamedTuple):
@@ -154,28 +172,7 @@ class Found(NamedTuple):
     lift: F64  # (L, A)
 
 
-@compiled
-def _hand_parts(hand: Hand, opening: int) -> Parts:
-    return Parts(
-        hand.points_m[opening],
-        hand.first,
-        hand.zeros,
-        hand.center_m[opening],
-        hand.half_m[opening],
-        hand.zeros,
-    )
-
-
-@compiled
-def _core_parts(hand: Hand, opening: int) -> Parts:
-    return Parts(
-        hand.core_points_m[opening],
-        hand.core_first,
-        hand.zeros,
-        hand.core_center_m[opening],
-        hand.core_half_m[opening],
-        hand.zeros,
-    )
+new_found = struct(Found)
 
 
 @compiled
@@ -196,15 +193,15 @@ def _moved(T: F64, back_m: float, rise_m: float, out: F64) -> None:
 @compiled
 def clears_target(hand: Hand, room: Room, limits: Limits, T: F64, opening: int, w: HandWork) -> bool:
     """Whether the hand clears the target along its approach; its core may not touch, its skin may."""
-    parts, core = _hand_parts(hand, opening), _core_parts(hand, opening)
+    parts, core = hand.whole, hand.core
     still, rows, at = room.still, room.near_target, w.frame
     n = points_on(limits.pregrasp_m, limits.line_step_m)
     _moved(T, limits.pregrasp_m, 0.0, at[0])
-    if hits_still(parts, at, still, rows, ~TARGET, limits.margin_m + limits.slack_m, w.whole):
+    if hits_still(parts, opening, at, still, rows, ~TARGET, limits.margin_m + limits.slack_m, w.whole):
         return False
     for k in range(n - 1):
         _moved(T, limits.pregrasp_m * k / (n - 1), 0.0, at[0])
-        if hits_still(core, at, still, rows, ~TARGET, 0.0, w.core):
+        if hits_still(core, opening, at, still, rows, ~TARGET, 0.0, w.core):
             return False
     return True
 
@@ -212,21 +209,21 @@ def clears_target(hand: Hand, room: Room, limits: Limits, T: F64, opening: int, 
 @compiled
 def is_hand_free(hand: Hand, room: Room, limits: Limits, T: F64, opening: int, w: HandWork) -> bool:
     """Whether the hand clears all but the target along its approach and while it lifts."""
-    parts = _hand_parts(hand, opening)
+    parts = hand.whole
     still, rows, at = room.still, room.near_target, w.frame
     _moved(T, 0.0, 0.0, at[0])
-    if hits_still(parts, at, still, rows, TARGET, limits.hand_margin_m, w.whole):
+    if hits_still(parts, opening, at, still, rows, TARGET, limits.hand_margin_m, w.whole):
         return False
     n = points_on(limits.pregrasp_m, limits.line_step_m)
     for k in range(n - 1, 0, -1):
         _moved(T, limits.pregrasp_m * k / (n - 1), 0.0, at[0])
         margin_m = limits.margin_m + limits.slack_m if k == n - 1 else limits.hand_margin_m
-        if hits_still(parts, at, still, rows, TARGET, margin_m, w.whole):
+        if hits_still(parts, opening, at, still, rows, TARGET, margin_m, w.whole):
             return False
     n = points_on(limits.lift_m, limits.line_step_m)
     for k in range(1, n):
         _moved(T, 0.0, limits.lift_m * k / (n - 1), at[0])
-        if hits_still(parts, at, still, rows, TARGET, limits.hand_margin_m, w.whole):
+        if hits_still(parts, opening, at, still, rows, TARGET, limits.hand_margin_m, w.whole):
             return False
     return True
 
@@ -248,7 +245,7 @@ def _free(hand: Hand, room: Room, limits: Limits, poses: Poses, k: int, w: HandW
 @compiled
 def clear_poses(hand: Hand, room: Room, limits: Limits, T: F64, opening: Ints) -> Bools:
     """Whether the hand at poses (K, 3, 4) clears the target (K,)."""
-    still, parts = len(room.still.kind), len(hand.zeros)
+    still, parts = len(room.still.kind), len(hand.whole.owner)
     w, out = hand_workspace(parts, still), np.empty(len(T), np.bool_)
     for k in range(len(T)):
         out[k] = clears_target(hand, room, limits, T[k], opening[k], w)
@@ -258,7 +255,7 @@ def clear_poses(hand: Hand, room: Room, limits: Limits, T: F64, opening: Ints) -
 @compiled
 def free_poses(hand: Hand, room: Room, limits: Limits, poses: Poses, first: int, end: int) -> int:
     """Check the poses from `first` to `end` in the scene; how many of them are free."""
-    w, total = hand_workspace(len(hand.zeros), len(room.still.kind)), 0
+    w, total = hand_workspace(len(hand.whole.owner), len(room.still.kind)), 0
     for k in range(first, end):
         total += _free(hand, room, limits, poses, k, w)
     return total
@@ -267,16 +264,16 @@ def free_poses(hand: Hand, room: Room, limits: Limits, poses: Poses, first: int,
 @compiled
 def hand_workspace(parts: int, still: int) -> HandWork:
     """Arrays for checks of the hand alone."""
-    return HandWork(np.empty((1, 3, 4)), scratch_of(parts, still), scratch_of(parts, still))
+    return new_hand_work(np.empty((1, 3, 4)), scratch_of(parts, still), scratch_of(parts, still))
 
 
 @compiled
 def workspace(arm: Arm, hand: Hand, room: Room) -> Work:
     """Arrays for one candidate: no result depends on earlier ones."""
-    still, parts = len(room.still.kind), len(hand.zeros)
+    still, parts = len(room.still.kind), len(hand.whole.owner)
     own = scratch_of(len(arm.own.owner), 0)
     radii_m(arm.own, own.half_m[:, 0])
-    return Work(
+    return new_work(
         np.empty((len(arm.tree.parent), 3, 4)),
         np.empty((len(arm.tree.frame_joint) + 1, 3, 4)),
         ik_workspace(arm.tree),
@@ -309,12 +306,12 @@ def is_blocked(
 ) -> bool:
     """Whether the arm, and with an opening of 0 or more the hand, collides at the coordinates (A,)."""
     _pose_arm(arm, T_root, q, w)
-    if hits_still(arm.body, w.frames, room.still, rows, ignored, limits.margin_m, w.body):
+    if hits_still(arm.body, 0, w.frames, room.still, rows, ignored, limits.margin_m, w.body):
         return True
     if opening >= 0:
         w.hand.frame[0] = w.frames[-2]
-        parts = _hand_parts(hand, opening)
-        if hits_still(parts, w.hand.frame, room.still, rows, ignored, limits.margin_m, w.hand.whole):
+        parts = hand.whole
+        if hits_still(parts, opening, w.hand.frame, room.still, rows, ignored, limits.margin_m, w.hand.whole):
             return True
     return hits_itself(arm.own, arm.own_pairs, w.frames, w.own_axes, w.own)
 
@@ -612,6 +609,7 @@ class Plan(NamedTuple):
     q_reach: F64  # (M, A)
     q_approach: F64  # (B, A)
     q_lift: F64  # (L, A)
+    length: float  # of reach and approach, radians
     clearance_m: float
     asks: bool  # whether it is not known yet that the hand holds the object there
 
@@ -619,7 +617,7 @@ class Plan(NamedTuple):
 @compiled
 def _no_plan(arm: Arm, stage: int, tried: int) -> Plan:
     none = np.empty((0, len(arm.weight)))
-    return Plan(stage, tried, -1, np.zeros((3, 4)), 0, -1, none, none, none, 0.0, False)
+    return Plan(stage, tried, -1, np.zeros((3, 4)), 0, -1, none, none, none, 0.0, 0.0, False)
 
 
 class Base(NamedTuple):
@@ -632,6 +630,14 @@ class Base(NamedTuple):
     far_q: F64  # (S, 2, A), at the grasp and the pregrasp
     far_of: Ints  # (S, 2), row and opening
     counts: Ints  # (2,), how many of `far_T` are filled; whether the base itself is stuck
+
+
+new_base = struct(Base)
+
+
+@compiled
+def _fully_open(hand: Hand) -> int:
+    return len(hand.whole.center_m) // len(hand.whole.owner) - 1
 
 
 @compiled
@@ -713,7 +719,7 @@ def _try_pose(
             continue
         if is_blocked(arm, hand, room, limits, T_root, rows, q, -1, 0, w):
             continue
-        if not _has_free_home(arm, hand, room, limits, base, len(hand.points_m) - 1, w):
+        if not _has_free_home(arm, hand, room, limits, base, _fully_open(hand), w):
             return NO_START, home
         stage = max(stage, NO_APPROACH)
         # The end of the lift is checked first: where the arm is too short for it, the lines cost most.
@@ -774,22 +780,27 @@ def _whole(
     asks: bool,
     w: Work,
 ) -> Plan:
+    length = 0.0
+    for k in range(1, len(q_reach)):
+        length += _length(arm, q_reach[k - 1], q_reach[k])
+    for k in range(1, len(found.back)):
+        length += _length(arm, found.back[k - 1], found.back[k])
     clearance_m, some = _FAR_M, min(_CLEARANCE_POSES, len(q_reach))
-    parts = _hand_parts(hand, opening)
+    parts = hand.whole
     for look in range(2):  # first the parts whose boxes are nearest: then few others need a distance
         for k in range(some):
             q = q_reach[int(round(k * (len(q_reach) - 1) / max(some - 1, 1)))]
             _pose_arm(arm, base.T_root, q, w)
             w.hand.frame[0] = w.frames[-2]
             clearance_m = smallest_gap_m(
-                parts, w.hand.frame, room.still, base.rows, look == 0, clearance_m, w.hand.whole
+                parts, opening, w.hand.frame, room.still, base.rows, look == 0, clearance_m, w.hand.whole
             )
             clearance_m = smallest_gap_m(
-                arm.body, w.frames, room.still, base.rows, look == 0, clearance_m, w.body
+                arm.body, 0, w.frames, room.still, base.rows, look == 0, clearance_m, w.body
             )
     return Plan(
         SUCCESS, tried, row, found.T.copy(), opening, home, q_reach, found.back[::-1].copy(), found.lift.copy(),
-        clearance_m, asks,
+        length, clearance_m, asks,
     )  # fmt: skip
 
 
@@ -824,8 +835,8 @@ def base_at(arm: Arm, room: Room, T_root: F64, reach_m: float, shoulder_m: F64, 
     for f in range(len(frames)):
         _compose(T_root, arm.tree.T_joint_frame[f], frames[f])
     s = scratch_of(len(arm.fixed.owner), len(room.still.kind))
-    counts[1] = hits_still(arm.fixed, frames, room.still, rows, FLOOR, 0.0, s)
-    return Base(
+    counts[1] = hits_still(arm.fixed, 0, frames, room.still, rows, FLOOR, 0.0, s)
+    return new_base(
         T_root, rows, np.zeros(len(arm.homes), np.int8), np.empty((_SEARCHES, 3, 4)),
         np.empty((_SEARCHES, 2, count)), np.empty((_SEARCHES, 2), np.int64), counts,
     )  # fmt: skip
@@ -902,12 +913,12 @@ def search(
     w = workspace(arm, hand, room)
     base = base_at(arm, room, T_root, reach_m, shoulder_m, w)
     count = len(arm.weight)
-    found = Found(
+    found = new_found(
         np.empty((3, 4)), np.empty(count), np.empty(count),
         np.empty((points_on(limits.pregrasp_m, limits.line_step_m), count)),
         np.empty((points_on(limits.lift_m, limits.line_step_m), count)),
     )  # fmt: skip
-    scores = Scores(np.empty((3, 4)), np.empty((3, 4)), np.empty(7, np.int64), np.empty(8))
+    scores = new_scores(np.empty((3, 4)), np.empty((3, 4)), np.empty(7, np.int64), np.empty(8))
     stages, order = np.full(len(poses.opening), -1, np.int8), np.empty(len(poses.opening), np.int64)
     short, shorts = np.empty(_SHORT, np.int64), 0  # poses from which the arm is too short to lift
     furthest, tried, start, end = NO_IK, 0, 0, max(first, _PORTION)
@@ -938,7 +949,7 @@ def search(
     plan = _search_paths(arm, hand, room, limits, base, poses, tried, furthest, found, w, rng)
     if plan.stage == SUCCESS or furthest < NO_APPROACH:
         return plan
-    near = _Near(
+    near = _new_near(
         np.empty((_ORIGINS, 3, 4)),
         np.empty(_ORIGINS, np.int64),
         np.zeros((_ORIGINS, 5)),
@@ -970,6 +981,9 @@ class _Near(NamedTuple):
     # (N, 5): turn about y, the closing axis; tilts about x and z; shifts along x and z
     motion: F64
     count: Ints  # (1,), how many are filled
+
+
+_new_near = struct(_Near)
 
 
 @compiled
