@@ -62,7 +62,10 @@ class HandScene:
     hand: Hand
     grasps: GraspSet
     grasp: Ints  # (K,), row of `grasps`
-    poses: Poses
+    arrays: Poses
+    poses: Poses  # the same in memory
+    low_m: F64  # (F, 3), boxes of the room's parts
+    high_m: F64
     first: int  # poses that are checked in every scene
     grasps_free: int  # of those that are checked in every scene
     opening_m: F64  # (O,), of the hand
@@ -165,7 +168,20 @@ def hand_scene(
         free_poses(*checked, first, len(grasp))
     free = len(np.unique(grasp[poses.is_free > 0]))
     opening_m = np.append(np.unique(grasps.opening_m.astype(np.float64)), gripper.max_opening_m)
-    return HandScene(T_world_target, room, hand, grasps, grasp, poses, first, free, opening_m)
+    return HandScene(
+        T_world_target,
+        room,
+        hand,
+        grasps,
+        grasp,
+        poses,
+        checked[-1],
+        still.low_m,
+        still.high_m,
+        first,
+        free,
+        opening_m,
+    )
 
 
 _clear: WeakKeyDictionary[GraspSet, dict[tuple[str, Limits], tuple[Hand, Ints, F64, Ints]]] = (

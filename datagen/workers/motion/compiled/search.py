@@ -25,6 +25,7 @@ from datagen.workers.motion.compiled.contacts import (
 )
 from datagen.workers.motion.compiled.kinematics import (
     IkWork,
+    compose,
     frame_poses,
     ik_workspace,
     joint_poses,
@@ -37,16 +38,12 @@ from datagen.workers.robots.kinematic_tree import Bools, Ints, KinematicTree
 TARGET, FLOOR = 1, 2  # kinds of still parts
 NO_IK, ARM_COLLISION, NO_START, NO_APPROACH, NO_LIFT, NO_PATH, SUCCESS = range(7)
 _STARTS = 3  # tucked poses from which a straight line is tried
-_SEARCHES = 4  # poses for which a path is searched where no straight path is free
+SEARCHES = 4  # poses for which a path is searched where no straight path is free
 _SHORTCUTS = 20
 _CLEARANCE_POSES = 8
 _SAME = 0.05  # solutions of one pose that differ by less count as one
 _LONGEST_EDGE = 1.0
 _FIRST_LOOK = 8  # stride of the first, coarse check of a long line
-_PORTION = 96  # poses scored together at first; each further portion is as large as all before
-_SHORT = 8  # poses tried to tell a lift that is too far from no solution
-# The search near poses: poses in one round, the most that they are near, and those for which IK is tried.
-_NEARBY, _ORIGINS, _NEARBY_TRIED = 480, 24, 48
 _TURN_STD_RAD = math.radians(20)  # about the closing axis
 # About the pads' width and about the approach, in each round and in all: within the contacts' friction cone.
 _TILT_STD_RAD, _MOST_TILT_RAD = math.radians(3), math.radians(8)
@@ -597,42 +594,44 @@ def _shortened(
     return path
 
 
-class Plan(NamedTuple):
-    """What a search found: its furthest stage, and with `SUCCESS` the whole plan."""
-
-    stage: int
-    tried: int  # poses for which inverse kinematics was tried
-    pose: int  # row of the poses, or -1 for one near them
-    T_world_tcp: F64  # (3, 4)
-    opening: int
-    home: int
-    q_reach: F64  # (M, A)
-    q_approach: F64  # (B, A)
-    q_lift: F64  # (L, A)
-    length: float  # of reach and approach, radians
-    clearance_m: float
-    asks: bool  # whether it is not known yet that the hand holds the object there
-
-
-@compiled
-def _no_plan(arm: Arm, stage: int, tried: int) -> Plan:
-    none = np.empty((0, len(arm.weight)))
-    return Plan(stage, tried, -1, np.zeros((3, 4)), 0, -1, none, none, none, 0.0, 0.0, False)
-
-
 class Base(NamedTuple):
-    """One base pose in a scene, and what the search knows there."""
+    """One base pose in a scene, and what the search has found there so far."""
 
     T_root: F64  # (3, 4), world
     rows: Ints  # still parts within the arm's reach
     homes: npt.NDArray[np.int8]  # (H,), 1 where the tucked pose is free, -1 where not, 0 not known
-    far_T: F64  # (S, 3, 4), poses without a free straight path
+    far_T: F64  # (S, 3, 4), free poses without a free straight path
     far_q: F64  # (S, 2, A), at the grasp and the pregrasp
-    far_of: Ints  # (S, 2), row and opening
-    counts: Ints  # (2,), how many of `far_T` are filled; whether the base itself is stuck
+    far: Ints  # (1,), how many are filled
+    is_stuck: bool  # the robot collides without its arm
 
 
-new_base = struct(Base)
+struct(Base)
+
+
+@compiled
+def is_stuck(arm: Arm, room: Room, T_root: F64, rows: Ints) -> bool:
+    """Whether links that no joint moves collide with anything but the floor."""
+    tree = arm.tree
+    frames = np.empty((len(tree.frame_joint), 3, 4))
+    for f in range(len(frames)):
+        compose(T_root, tree.T_joint_frame[f], frames[f])
+    s = scratch_of(len(arm.fixed.owner), len(room.still.kind))
+    return hits_still(arm.fixed, 0, frames, room.still, rows, FLOOR, 0.0, s)
+
+
+@compiled
+def new_search(arm: Arm, hand: Hand, room: Room, limits: Limits) -> tuple[Work, Found]:
+    """Arrays for one candidate: no result depends on earlier ones."""
+    count = len(arm.weight)
+    found = new_found(
+        np.empty((3, 4)),
+        np.empty(count),
+        np.empty(count),
+        np.empty((points_on(limits.pregrasp_m, limits.line_step_m), count)),
+        np.empty((points_on(limits.lift_m, limits.line_step_m), count)),
+    )
+    return workspace(arm, hand, room), found
 
 
 @compiled
@@ -659,13 +658,23 @@ def _homes_by_distance(arm: Arm, base: Base, q: F64) -> Ints:
 
 
 @compiled
-def _try_pose(
+def _inverse_times(A: F64, B: F64, out: F64) -> None:
+    """out = inverse(A) B for poses (3, 4)."""
+    for i in range(3):
+        for k in range(4):
+            s = 0.0
+            for m in range(3):
+                s += A[m, i] * (B[m, k] - (A[m, 3] if k == 3 else 0.0))
+            out[i, k] = s
+
+
+@compiled
+def try_pose(
     arm: Arm,
     hand: Hand,
     room: Room,
     limits: Limits,
     base: Base,
-    row: int,
     T: F64,
     opening: int,
     w: Work,
@@ -713,7 +722,7 @@ def _try_pose(
         if not solve(arm.tree, T_root, pregrasp, found.q_pregrasp, w.ik):
             continue
         stage = max(stage, ARM_COLLISION)
-        if base.counts[1]:
+        if base.is_stuck:
             return stage, home
         if is_blocked(arm, hand, room, limits, T_root, rows, found.q_pregrasp, opening, 0, w):
             continue
@@ -745,39 +754,34 @@ def _try_pose(
             ):
                 found.T[:] = T
                 return SUCCESS, h
-        k = base.counts[0]
-        if k < _SEARCHES:
+        k = base.far[0]
+        if k < SEARCHES:
             base.far_T[k], base.far_q[k, 0], base.far_q[k, 1] = T, q, found.q_pregrasp
-            base.far_of[k, 0], base.far_of[k, 1] = row, opening
-            base.counts[0] += 1
+            base.far[0] += 1
     return stage, home
 
 
-@compiled
-def _inverse_times(A: F64, B: F64, out: F64) -> None:
-    """out = inverse(A) B for poses (3, 4)."""
-    for i in range(3):
-        for k in range(4):
-            s = 0.0
-            for m in range(3):
-                s += A[m, i] * (B[m, k] - (A[m, 3] if k == 3 else 0.0))
-            out[i, k] = s
+class Lines(NamedTuple):
+    """A whole plan as coordinates; neighbouring rows are joined by straight lines."""
+
+    q_reach: F64  # (M, A), tucked to pregrasp
+    q_approach: F64  # (B, A)
+    q_lift: F64  # (L, A)
+    length: float  # of reach and approach, radians
+    clearance_m: float  # smallest distance of arm and scene over `q_reach`
 
 
 @compiled
-def _whole(
+def whole_plan(
     arm: Arm,
     hand: Hand,
     room: Room,
     limits: Limits,
     base: Base,
-    tried: int,
-    row: int,
     opening: int,
     home: int,
     q_reach: F64,
     found: Found,
-    asks: bool,
     w: Work,
 ) -> Plan:
     length = 0.0
@@ -798,56 +802,7 @@ def _whole(
             clearance_m = smallest_gap_m(
                 arm.body, 0, w.frames, room.still, base.rows, look == 0, clearance_m, w.body
             )
-    return Plan(
-        SUCCESS, tried, row, found.T.copy(), opening, home, q_reach, found.back[::-1].copy(), found.lift.copy(),
-        length, clearance_m, asks,
-    )  # fmt: skip
-
-
-@compiled
-def _straight(arm: Arm, a: F64, b: F64, step: float) -> F64:
-    corners = np.empty((2, len(a)))
-    corners[0], corners[1] = a, b
-    return dense(arm, corners, step)
-
-
-@compiled
-def base_at(arm: Arm, room: Room, T_root: F64, reach_m: float, shoulder_m: F64, w: Work) -> Base:
-    """The still parts within reach of a base pose, and whether the robot's fixed links collide there."""
-    center = np.empty(3)
-    for i in range(3):
-        center[i] = T_root[i, 3]
-        for k in range(3):
-            center[i] += T_root[i, k] * shoulder_m[k]
-    rows, n = np.empty(len(room.still.kind), np.int64), 0
-    for f in range(len(rows)):
-        is_near = True
-        for i in range(3):
-            is_near &= room.still.low_m[f, i] <= center[i] + reach_m
-            is_near &= room.still.high_m[f, i] >= center[i] - reach_m
-        if is_near:
-            rows[n] = f
-            n += 1
-    rows = rows[:n].copy()
-    count = len(arm.weight)
-    counts = np.zeros(2, np.int64)
-    frames = np.empty((len(arm.tree.frame_joint), 3, 4))
-    for f in range(len(frames)):
-        _compose(T_root, arm.tree.T_joint_frame[f], frames[f])
-    s = scratch_of(len(arm.fixed.owner), len(room.still.kind))
-    counts[1] = hits_still(arm.fixed, 0, frames, room.still, rows, FLOOR, 0.0, s)
-    return new_base(
-        T_root, rows, np.zeros(len(arm.homes), np.int8), np.empty((_SEARCHES, 3, 4)),
-        np.empty((_SEARCHES, 2, count)), np.empty((_SEARCHES, 2), np.int64), counts,
-    )  # fmt: skip
-
-
-@compiled
-def _compose(A: F64, B: F64, out: F64) -> None:
-    for i in range(3):
-        for k in range(4):
-            out[i, k] = A[i, 0] * B[0, k] + A[i, 1] * B[1, k] + A[i, 2] * B[2, k]
-        out[i, 3] += A[i, 3]
+    return Lines(q_reach, found.back[::-1].copy(), found.lift.copy(), length, clearance_m)
 
 
 @compiled
@@ -868,122 +823,36 @@ def _score(arm: Arm, limits: Limits, base: Base, T: F64, s: Scores) -> tuple[int
 
 
 @compiled
-def _try(
+def best_first(
     arm: Arm,
     hand: Hand,
     room: Room,
     limits: Limits,
     base: Base,
     poses: Poses,
-    k: int,
-    tried: int,
-    found: Found,
+    start: int,
+    end: int,
+    short: Ints,
     w: Work,
-) -> Plan:
-    """Try the free pose `k`: the stage it leads to, with a whole plan where that is `SUCCESS`."""
-    T, opening = poses.T_world_tcp[k], poses.opening[k]
-    stage, home = _try_pose(arm, hand, room, limits, base, k, T, opening, w, found)
-    if stage != SUCCESS:
-        return _no_plan(arm, stage, tried + 1)
-    q_reach = _straight(arm, arm.homes[home], found.q_pregrasp, limits.step)
-    asks = poses.holds[k] == 0
-    return _whole(arm, hand, room, limits, base, tried + 1, k, opening, home, q_reach, found, asks, w)
+) -> Ints:
+    """The free poses from `start` to `end` that can be reached, those with most samples near them first.
 
-
-@compiled
-def search(
-    arm: Arm,
-    hand: Hand,
-    room: Room,
-    limits: Limits,
-    poses: Poses,
-    first: int,
-    T_root: F64,
-    reach_m: float,
-    shoulder_m: F64,
-    rounds: int,
-    skips: int,
-    rng: np.random.Generator,
-) -> Plan:
-    """Search for a whole plan from the base pose (3, 4) to any of the poses, then near those that came furthest.
-
-    Poses with most samples of the reach map near them come first. A success at a pose whose hold is not known
-    `asks`; one near the poses too, except the first `skips`, which are known not to hold.
+    Poses that can be reached and not lifted go to `short`, behind those that are there, while there is room.
     """
-    w = workspace(arm, hand, room)
-    base = base_at(arm, room, T_root, reach_m, shoulder_m, w)
-    count = len(arm.weight)
-    found = new_found(
-        np.empty((3, 4)), np.empty(count), np.empty(count),
-        np.empty((points_on(limits.pregrasp_m, limits.line_step_m), count)),
-        np.empty((points_on(limits.lift_m, limits.line_step_m), count)),
-    )  # fmt: skip
     scores = new_scores(np.empty((3, 4)), np.empty((3, 4)), np.empty(7, np.int64), np.empty(8))
-    stages, order = np.full(len(poses.opening), -1, np.int8), np.empty(len(poses.opening), np.int64)
-    short, shorts = np.empty(_SHORT, np.int64), 0  # poses from which the arm is too short to lift
-    furthest, tried, start, end = NO_IK, 0, 0, max(first, _PORTION)
-    while start < len(order) and tried < limits.tries:
-        end = min(end, len(order))
-        some = np.zeros(end - start)
-        for k in range(start, end):
-            if poses.holds[k] >= 0 and _free(hand, room, limits, poses, k, w.hand):
-                reached, lifted = _score(arm, limits, base, poses.T_world_tcp[k], scores)
-                some[k - start] = -lifted
-                if lifted == 0 and reached > 0 and shorts < _SHORT:
-                    short[shorts] = k
-                    shorts += 1
-        for k in np.argsort(some, kind="mergesort"):
-            if some[k] == 0 or tried >= limits.tries:
-                break
-            plan = _try(arm, hand, room, limits, base, poses, start + k, tried, found, w)
-            tried = plan.tried
-            stages[start + k] = plan.stage
-            furthest = max(furthest, plan.stage)
-            if plan.stage == SUCCESS or plan.stage == NO_START:
-                return plan
-        start, end = end, 2 * end
-    for k in short[:shorts]:
-        # They get no further than the lift.
-        if furthest < NO_LIFT:
-            furthest = max(furthest, _try(arm, hand, room, limits, base, poses, k, tried, found, w).stage)
-    plan = _search_paths(arm, hand, room, limits, base, poses, tried, furthest, found, w, rng)
-    if plan.stage == SUCCESS or furthest < NO_APPROACH:
-        return plan
-    near = _new_near(
-        np.empty((_ORIGINS, 3, 4)),
-        np.empty(_ORIGINS, np.int64),
-        np.zeros((_ORIGINS, 5)),
-        np.zeros(1, np.int64),
-    )
-    best = np.argsort(-stages, kind="mergesort")
-    for k in best[:_ORIGINS]:
-        if stages[k] < 0:
-            break
-        m = near.count[0]
-        near.T[m], near.opening[m] = poses.T_world_tcp[k], poses.opening[k]
-        near.count[0] += 1
-    for _ in range(rounds):
-        base.counts[0] = 0
-        plan, skips = _search_near(
-            arm, hand, room, limits, base, poses, near, tried, furthest, skips, found, scores, w, rng
-        )
-        tried, furthest = plan.tried, max(furthest, plan.stage)
-        if plan.stage == SUCCESS or near.count[0] == 0:
-            return plan
-    return _no_plan(arm, furthest, tried)
-
-
-class _Near(NamedTuple):
-    """Poses that a round of the search near them begins with: a grasp and a motion in its frame."""
-
-    T: F64  # (N, 3, 4), grasps, world
-    opening: Ints  # (N,)
-    # (N, 5): turn about y, the closing axis; tilts about x and z; shifts along x and z
-    motion: F64
-    count: Ints  # (1,), how many are filled
-
-
-_new_near = struct(_Near)
+    some = np.zeros(end - start)
+    for k in range(start, end):
+        if poses.holds[k] < 0 or not _free(hand, room, limits, poses, k, w.hand):
+            continue
+        reached, lifted = _score(arm, limits, base, poses.T_world_tcp[k], scores)
+        some[k - start] = -lifted
+        if lifted == 0 and reached > 0:
+            for m in range(len(short)):
+                if short[m] < 0:
+                    short[m] = k
+                    break
+    order = np.argsort(some, kind="mergesort")
+    return start + order[: np.count_nonzero(some)]
 
 
 @compiled
@@ -1011,116 +880,90 @@ def _varied(T: F64, motion: F64, rng: np.random.Generator, new: F64, out: F64) -
 
 
 @compiled
-def _search_near(
+def poses_near(
     arm: Arm,
     hand: Hand,
     room: Room,
     limits: Limits,
     base: Base,
-    poses: Poses,
-    near: _Near,
-    tried: int,
-    furthest: int,
-    skips: int,
-    found: Found,
-    scores: Scores,
+    T_grasp: F64,
+    before: F64,
+    opening: Ints,
+    each: int,
     w: Work,
     rng: np.random.Generator,
-) -> tuple[Plan, int]:
-    """One round of the search near poses: `near` then has the best of those tried. Also the skips left."""
-    n = near.count[0]
-    each = _NEARBY // n
-    T, motion = np.empty((n * each, 3, 4)), np.empty((n * each, 5))
-    some, opening = np.zeros(n * each), np.empty(n * each, np.int64)
-    origin = np.empty(n * each, np.int64)
-    for k in range(n * each):
-        origin[k], opening[k] = k // each, near.opening[k // each]
-        _varied(near.T[origin[k]], near.motion[origin[k]], rng, motion[k], T[k])
+) -> tuple[F64, F64, Ints]:
+    """`each` random poses (N * each, 3, 4) near N poses, their motions (N * each, 5), and the rows to try, best first.
+
+    A pose is a grasp (3, 4) moved in its own frame by a motion (5,): turn about y, tilts about x and z, shifts
+    along x and z.
+    """
+    scores = new_scores(np.empty((3, 4)), np.empty((3, 4)), np.empty(7, np.int64), np.empty(8))
+    n = len(T_grasp) * each
+    T, motion, some = np.empty((n, 3, 4)), np.empty((n, 5)), np.zeros(n)
+    for k in range(n):
+        _varied(T_grasp[k // each], before[k // each], rng, motion[k], T[k])
         _, lifted = _score(arm, limits, base, T[k], scores)
-        if (
-            lifted > 0
-            and is_hand_free(hand, room, limits, T[k], opening[k], w.hand)
-            and clears_target(hand, room, limits, T[k], opening[k], w.hand)
-        ):
-            some[k] = -lifted
-    stages = np.full(n * each, -1, np.int8)
-    left = _NEARBY_TRIED
-    for k in np.argsort(some, kind="mergesort"):
-        if some[k] == 0 or left == 0:
-            break
-        left -= 1
-        tried += 1
-        stage, home = _try_pose(arm, hand, room, limits, base, -1, T[k], opening[k], w, found)
-        if stage == SUCCESS and skips > 0:
-            skips -= 1
-            continue
-        stages[k] = stage
-        furthest = max(furthest, stage)
-        if stage == SUCCESS:
-            q_reach = _straight(arm, arm.homes[home], found.q_pregrasp, limits.step)
-            whole = _whole(
-                arm, hand, room, limits, base, tried, -1, opening[k], home, q_reach, found, True, w
-            )
-            return whole, skips
-    if skips == 0:
-        plan = _search_paths(arm, hand, room, limits, base, poses, tried, furthest, found, w, rng)
-        if plan.stage == SUCCESS:
-            return plan, skips
-    best, rows = np.argsort(-stages, kind="mergesort"), 0
-    next_T, next_motion = np.empty((_ORIGINS, 3, 4)), np.empty((_ORIGINS, 5))
-    next_opening = np.empty(_ORIGINS, np.int64)
-    for k in best[:_ORIGINS]:
-        if stages[k] < ARM_COLLISION:
-            break
-        next_T[rows], next_motion[rows], next_opening[rows] = near.T[origin[k]], motion[k], opening[k]
-        rows += 1
-    near.T[:rows], near.motion[:rows], near.opening[:rows] = (
-        next_T[:rows],
-        next_motion[:rows],
-        next_opening[:rows],
-    )
-    near.count[0] = rows
-    return _no_plan(arm, furthest, tried), skips
+        if lifted > 0 and is_hand_free(hand, room, limits, T[k], opening[k // each], w.hand):
+            if clears_target(hand, room, limits, T[k], opening[k // each], w.hand):
+                some[k] = -lifted
+    order = np.argsort(some, kind="mergesort")
+    return T, motion, order[: np.count_nonzero(some)]
 
 
 @compiled
-def _search_paths(
+def path_to(
     arm: Arm,
     hand: Hand,
     room: Room,
     limits: Limits,
     base: Base,
-    poses: Poses,
-    tried: int,
-    furthest: int,
-    found: Found,
+    k: int,
+    opening: int,
+    iterations: int,
     w: Work,
+    found: Found,
     rng: np.random.Generator,
-) -> Plan:
-    """Search a path to the first poses without a straight one; they share the iterations evenly."""
-    left, n = limits.iterations, base.counts[0]
-    for k in range(n):
-        T, q, q_pregrasp = base.far_T[k], base.far_q[k, 0], base.far_q[k, 1]
-        row, opening = base.far_of[k, 0], base.far_of[k, 1]
-        home = _homes_by_distance(arm, base, q_pregrasp)[0]
-        corners, used = connect(
-            arm, hand, room, limits, base.T_root, base.rows, opening, arm.homes[home], q_pregrasp,
-            left // (n - k), w, rng,
-        )  # fmt: skip
-        left -= used
-        if len(corners) == 0:
-            continue
-        path = dense(arm, corners, limits.step)
-        path = _shortened(arm, hand, room, limits, base.T_root, base.rows, opening, path, w, rng)
-        found.T[:] = T
-        _follow(
-            arm, hand, room, limits, base.T_root, base.rows, T, limits.pregrasp_m, 0.0, q, q_pregrasp, True, 0, w,
-            found.back,
-        )  # fmt: skip
-        _follow(
-            arm, hand, room, limits, base.T_root, base.rows, T, 0.0, limits.lift_m, q, q, False, TARGET, w,
-            found.lift,
-        )  # fmt: skip
-        asks = row < 0 or poses.holds[row] == 0
-        return _whole(arm, hand, room, limits, base, tried, row, opening, home, path, found, asks, w)
-    return _no_plan(arm, furthest, tried)
+) -> tuple[F64, int, int]:
+    """A free path (M, A) to pose `k` of those without a straight one, its tucked pose, and the samples used.
+
+    M is 0 where none was found; `found` gets the pose's lines.
+    """
+    T, q, q_pregrasp = base.far_T[k], base.far_q[k, 0], base.far_q[k, 1]
+    home = _homes_by_distance(arm, base, q_pregrasp)[0]
+    T_root, rows = base.T_root, base.rows
+    corners, used = connect(
+        arm, hand, room, limits, T_root, rows, opening, arm.homes[home], q_pregrasp, iterations, w, rng
+    )
+    if len(corners) == 0:
+        return corners, home, used
+    path = dense(arm, corners, limits.step)
+    path = _shortened(arm, hand, room, limits, T_root, rows, opening, path, w, rng)
+    found.T[:] = T
+    _follow(
+        arm,
+        hand,
+        room,
+        limits,
+        T_root,
+        rows,
+        T,
+        limits.pregrasp_m,
+        0.0,
+        q,
+        q_pregrasp,
+        True,
+        0,
+        w,
+        found.back,
+    )
+    _follow(arm, hand, room, limits, T_root, rows, T, 0.0, limits.lift_m, q, q, False, TARGET, w, found.lift)
+    return path, home, used
+
+
+@compiled
+def straight_path(arm: Arm, home: int, limits: Limits, found: Found) -> F64:
+    """The straight line (M, A) from a tucked pose to the pregrasp."""
+    corners = np.empty((2, len(arm.weight)))
+    corners[0], corners[1] = arm.homes[home], found.q_pregrasp
+    return dense(arm, corners, limits.step)
