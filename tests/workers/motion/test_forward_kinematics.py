@@ -10,12 +10,10 @@ from datagen.workers.motion.planning_scene import moving_of
 from datagen.workers.motion.reach_table import reach_table
 from datagen.workers.robots.robot import Robot
 from tests.workers.motion.tables import arm
-from tests.workers.robots.robots_under_test import CASES, label_of, opened
-
-HIGHEST = {case[:2]: case for case in CASES}  # one of each robot and reach
+from tests.workers.robots.robots_under_test import CASES, opened
 
 
-@pytest.fixture(params=HIGHEST.values(), ids=label_of)
+@pytest.fixture(params=CASES)
 def robot(request: pytest.FixtureRequest) -> Robot:
     return opened(request.param)
 
