@@ -52,7 +52,7 @@ class Coordinates:
         matrix = np.zeros((len(tree.ratio), len(tree.lower)))
         matrix[np.arange(len(tree.ratio)), tree.coordinate] = tree.ratio
         plain = matrix.shape[0] == matrix.shape[1] and bool((matrix == np.eye(len(matrix))).all())
-        slides = matrix[tree.slides].any(axis=0)
+        slides = np.array(matrix[tree.slides].any(axis=0))
         return Coordinates(
             matrix, tree.offset, tree.lower, tree.upper, slides, plain and not tree.offset.any()
         )
