@@ -282,7 +282,7 @@ def test_ik_solves_most_poses_from_random_seeds(robot: Robot) -> None:
         any(robot.ik(robot.T_base_tcp(x), s) is not None for s in near)
         for x, near in zip(q, seeds, strict=True)
     ]
-    assert np.mean(found) > 0.75
+    assert np.mean(found) > 0.9
 
 
 def test_the_hand_closes_on_a_box_of_each_width(robot: Robot) -> None:
