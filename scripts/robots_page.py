@@ -31,8 +31,9 @@ heights are refused.
 - **Hands.** The xArm and the UR5 carry the Franka hand. Fingers that turn close on what they measured: at
   each opening the bodies stand where the URDF puts them, and the pads' depth follows. In a trial such a
   finger slides, in the posture that it has at the planned opening.
-- **Drives** of joints that turn have stiffness 1000, damping 100 and force 100 N m (xArm: 500), of those
-  that slide 100 kN/m and 1 kN, and links have no gravity, as in ManiSkill.
+- **Drives** of joints that turn have stiffness 1000, damping 100 and force 100 N m (xArm: force
+  500 N m; TIAGo Pro: damping 50), of those that slide 100 kN/m
+  and 1 kN, and links have no gravity, as in ManiSkill.
 
 ## The scaled family
 

@@ -36,7 +36,7 @@ def measured(words: Sequence[str]) -> tuple[int, float, float]:
 
 
 def filled_run(folder: Path, commits: int) -> Run:
-    """A run as `submit` makes it, extended to so many shards, of which the last two are open."""
+    """A run as `submit` makes it, with N shards, of which the last two are open."""
     (folder / "config.toml").write_text(CONFIG)
     words = ["--candidates-per-scene", str(PER_SCENE), "--config", str(folder / "config.toml"), "--no-seal"]
     given = [

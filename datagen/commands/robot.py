@@ -103,15 +103,11 @@ def _base(robot: Robot) -> Rows:
     if base.height_m is not None:
         given = keys.base.footprint_m or keys.base.radius_m
         within = f"{outline} within {base.radius_m:.3f} m of the mount"
-        presents = {
-            "faces": "faces",
-            "side": f"stands {keys.base.angle_deg:g} deg to",
-            "turns": "turns in place to",
-        }
+        presents = "turns in place to" if robot.presents == "turns" else "faces"
         rows = [
             ("mount", f"{base.height_m:.3f} m above the floor{_origin(keys.base.height_m)}"),
             ("footprint", within + _origin(given)),
-            ("base", f"{presents[robot.presents]} the target"),
+            ("base", f"{presents} the target"),
         ]
     tucked = f"{len(robot.homes_rad)} poses{_origin(keys.arm.tucked)}"
     shapes = f"{parts} convex parts of {len(robot.link_names)} bodies, {pairs} pairs checked"

@@ -218,7 +218,7 @@ def complete_arm(
         if section in arm:
             problem = f"{label_source} runs no trials"
             raise InputError(place, f"arm.{section}", problem, "Remove the section, or submit sim")
-    named = robot or arm.get("robot", ArmParams().robot)
+    named = arm.get("robot", ArmParams().robot) if robot is None else robot
     if isinstance(named, str):
         is_known = robot is None and "robot_digest" in arm
         key = f"{named}@{arm['robot_digest']}" if is_known else named

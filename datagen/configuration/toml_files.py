@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,9 @@ from pydantic import ValidationError
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
 
-_MAX_BYTES, _MAX_DOTS = 1 << 20, 200
+_MAX_BYTES, _MOST_PARTS = 1 << 20, 200
+_TEXT = re.compile(r'"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*')  # quoted text and comments
+_BETWEEN = re.compile(r"[\n,=\[\]{}]")  # separates keys from values
 
 
 def read_toml(
@@ -22,8 +25,8 @@ def read_toml(
     try:
         text = data.decode()
         # The parser's memory grows with the square of the parts of a key.
-        if any(line.count(".") > _MAX_DOTS for line in text.splitlines()):
-            raise ValueError(f"a line has more than {_MAX_DOTS} dots")
+        if max(part.count(".") for part in _BETWEEN.split(_TEXT.sub("", text))) >= _MOST_PARTS:
+            raise ValueError(f"a key has more than {_MOST_PARTS} parts")
         content = tomllib.loads(text)
         repr(content)  # RecursionError where it is nested too deeply for an error message
         return content

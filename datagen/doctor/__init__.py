@@ -24,10 +24,9 @@ from rich.text import Text
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, size
 from datagen.doctor import engines
-from datagen.schemas.errors import InputError
 from datagen.workers.content_cache import cache_folder
 from datagen.workers.extras import EXTRAS, how_to_get
-from datagen.workers.robots import ROBOTS, robot_limits
+from datagen.workers.robots import ROBOTS, robot_source
 
 Status = Literal["ok", "warn", "fail"]
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
@@ -49,8 +48,6 @@ _MESA_FIX = (
     "Only --renderer sapien needs one; on a CPU it works with Mesa 25 or newer: "
     "on Debian 12 apt-get install -t bookworm-backports mesa-vulkan-drivers"
 )
-# Mount height for robots that allow any.
-_HEIGHT_M = 0.5
 
 
 class Problem(Exception):
@@ -114,13 +111,10 @@ def checks() -> Iterator[Check]:
             "arm libraries", partial(_probe, engines.LIBRARIES), f"Plan and sim labels need them. {again}"
         )
         for name in ROBOTS:
-            try:
-                limits = robot_limits(name)
-            except InputError:
-                continue  # its files are not installed, as the line of the extra says
-            height_m = limits.base_height_m[0] if limits.base_height_m else _HEIGHT_M
-            code = engines.ROBOT.format(name=name, reach_m=limits.reach_m[1], height_m=height_m)
-            yield Check(f"robot {name}", partial(_probe, code), f"Use another --robot, or: {again}")
+            from_sim = robot_source(name).keys.urdf.startswith("package:mani_skill/")
+            if from_sim or not EXTRAS["robots"].missing():  # the line of the extra says that it is missing
+                code = engines.ROBOT.format(name=name)
+                yield Check(f"robot {name}", partial(_probe, code), f"Use another --robot, or: {again}")
         fix = "See the settlers and robots above; plan labels need no physics."
         yield Check("grasp trial", partial(_probe, engines.TRIAL), fix)
 

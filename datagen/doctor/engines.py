@@ -73,8 +73,9 @@ assert hits(near) and not hits(far), "the collision check of two balls is wrong"
 print("pinocchio " + pinocchio.__version__ + ", coal " + importlib.metadata.version("coal"))
 """
 ROBOT = """
-from datagen.workers.robots import open_robot
-robot = open_robot({name!r}, {reach_m!r}, {height_m!r})
+from datagen.workers.robots import open_robot, robot_limits
+limits = robot_limits({name!r})
+robot = open_robot({name!r}, limits.reach_m[1], (limits.base_height_m or (0.5,))[0])
 home = robot.homes_rad[0]
 assert not robot.collides_itself(home), "the first tucked pose touches itself"
 hand = robot.gripper

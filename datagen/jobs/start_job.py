@@ -19,7 +19,7 @@ from datagen.console.command_lines import (
 from datagen.console.options import AS_FOUND, Sources
 from datagen.doctor.engines import probe_render_device
 from datagen.jobs.job import JobOptions, JobRun
-from datagen.replaying import open_sources
+from datagen.replaying import open_sources, places_of
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.specification import Specification
@@ -74,12 +74,13 @@ def open_job_run(run: Run, given: Sources, address: str) -> JobRun:
     refuse_other_engines(f"{run.storage.url}/manifest.json", spec)
     open_sources(run, given)
     refuse_unusable_engines(spec, address)
+    houses, objects, robot = places_of(run, given)
     return JobRun(
         run,
-        absolute_source(given.houses or known.get("houses", "builtin")),
-        absolute_source(given.objects or known.get("objects", "builtin")),
+        absolute_source(houses),
+        absolute_source(objects),
         "" if spec.scenes_from is None else absolute_path(given.scenes_from or known["scenes_from"]),
-        absolute_robot(given.robot or known.get("robot", "")),
+        absolute_robot(robot),
     )
 
 

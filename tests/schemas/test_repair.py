@@ -18,15 +18,17 @@ from datagen.schemas.checking.repair import Repaired, clean_runs, repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobRecord, Jobs, JobState, new_job_id
 from datagen.schemas.record_files import commit_key, utc_now
-from datagen.schemas.run import Run
+from datagen.schemas.run import Run, open_runs
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage, open_storage
 from tests.faults.crash_points_operations import remake
 from tests.made_runs import attempt, files_of, flip, make_run, write
 from tests.schemas.checked import (
     assert_rows,
+    fill,
     folder_of,
     found,
+    merge,
     sealed_run,
     stored,
     tree,
@@ -98,6 +100,23 @@ def test_a_run_on_s3_is_repaired(bucket: str) -> None:
     assert [f.kind for f in repaired.left] == ["lost"] and repaired.set_aside == ["commits/000001.json"]
     assert storage.exists(f"{repaired.into}/shards/a-1.zip")
     assert Run.open(storage).ledger.end_of("a-1").outcome == "superseded"  # type: ignore[union-attr]
+
+
+def test_a_repair_that_is_interrupted_is_continued_by_the_next(tmp_path: Path) -> None:
+    run = sealed_run(tmp_path, 39)
+    flip(tmp_path / "shards/a-1.zip")
+    plain = Storage.delete
+
+    def dies(storage: Storage, keys: Any) -> None:
+        plain(storage, list(keys)[:1])
+        raise KeyboardInterrupt
+
+    for _ in range(2):
+        with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(Storage, "delete", dies)
+            repair_at(tmp_path)
+    assert [f.kind for f in repair_at(tmp_path).left] == ["lost"] and run.committed() == {0, 2, 3}
+    assert list(run.storage.list("shards/a-1.zip")) == []
 
 
 HOUR_S = 3600
@@ -175,8 +194,9 @@ def test_nothing_is_removed_while_a_job_may_be_alive(
     jobs.begin(record)
     (tmp_path / "jobs/20200101T000000-00000000.json").write_bytes(b"damaged")
     if is_alive:
-        with pytest.raises(InputError, match="is running"):
-            clean_runs(run.storage, kept_s=-60)
+        for change in (clean_runs, repair_runs):
+            with pytest.raises(InputError, match="is running"):
+                change(run.storage)
         assert files_of(tmp_path).items() >= before.items()
         jobs.put_state(JobState(id=record.id, updated=utc_now(), phase="ended", end="complete"))
     assert clean_runs(run.storage, kept_s=-60).files == len(garbage)
@@ -191,3 +211,17 @@ def test_nothing_is_removed_where_a_damaged_record_may_name_it(tmp_path: Path) -
             clean_runs(run.storage, kept_s=-60)
         assert all((tmp_path / name).exists() for name in ("shards/a-0.zip", "data.zarr/zarr.json"))
         (tmp_path / key).write_bytes(whole)
+
+
+def test_parts_of_merged_runs_are_cleaned(tmp_path: Path) -> None:
+    for who, seed in (("a", 1), ("b", 2)):
+        fill(tmp_path, who, [0], seed=seed)
+    merge(tmp_path, "ab")
+    storage = open_storage(tmp_path / "out")
+    before = tree(storage)
+    part = open_runs(storage)[1]
+    write(part, 0, "late")
+    for key in (f".probe-{'c' * 16}", "data.zarr/x"):
+        part.storage.put(key, b"")
+    storage.put(f".probe-{'c' * 16}", b"")
+    assert clean_runs(storage, kept_s=-60).files == 4 and tree(storage) == before

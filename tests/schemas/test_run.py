@@ -17,7 +17,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMA_VERSION
 from datagen.schemas.record_files import copy_key, publish
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import FileEntry, Layout, LedgerEntry, StageClock
+from datagen.schemas.run_records import FileEntry, Layout, LedgerEntry, QuarantineRecord, StageClock
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import open_storage
 from tests.made_runs import commit_of, files_of, make_run, manifest_of, small_spec, write
@@ -66,6 +66,25 @@ def test_another_specification_is_refused_with_every_differing_field(tmp_path: P
     with pytest.raises(InputError, match=told):
         make_run(tmp_path, n=500, spec=small_spec(seed=7, n_points=65, split="val"), shards=[])
     assert files_of(tmp_path) == before
+
+
+def test_of_racing_committers_one_wins_and_the_run_holds_its_attempt(tmp_path: Path) -> None:
+    run = make_run(tmp_path, shards=[])
+    commits = [write(run, 0, f"attempt-{i}") for i in range(4)]
+    with ThreadPoolExecutor(4) as pool:
+        won = list(pool.map(run.commit, commits))
+    assert sum(won) == 1 and Run.open(tmp_path).commit_of(0).attempt == f"attempt-{won.index(True)}"
+
+
+def test_quarantine_takes_a_shard_from_the_missing_until_it_is_committed(tmp_path: Path) -> None:
+    run = make_run(tmp_path, n=30, shards=[0])
+    record = QuarantineRecord(
+        shard=2, seed=0, first_scene=4, scenes=2, attempts=("a",), causes=("c",), stacks=("s",), created="now"
+    )
+    assert run.quarantine(record) and not run.quarantine(record.model_copy(update={"created": "later"}))
+    assert (run.missing(), run.quarantined(), run.quarantine_records()) == ([1], {2}, [record])
+    assert run.commit(write(run, 2, "again"))
+    assert (run.missing(), run.quarantined()) == ([1], set())
 
 
 def test_an_object_is_written_once_and_read_as_committed(tmp_path: Path) -> None:

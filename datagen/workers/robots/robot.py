@@ -232,6 +232,13 @@ def _plain(corners_m: F32) -> Mesh:
     return Mesh(corners_m, faces, np.full((len(faces), 3), _GREY, np.uint8))
 
 
+def _damped_step(J: F64, error: F64, squared: float) -> F64:
+    """Change (A,) of the coordinates by the Jacobian (6, A) and the twist (6,) that is left."""
+    H = J.dot(J.T)
+    H.flat[::7] += _DAMPING + _DAMPING_PER_ERROR * squared
+    return J.T.dot(_lapack.dposv(H, error)[1])
+
+
 def solve(
     model: Any, data: Any, frame: int, coordinates: Coordinates, T_base_tcp: F64, q_seed_rad: F64
 ) -> F64 | None:
@@ -240,7 +247,7 @@ def solve(
     Levenberg-Marquardt with damping that grows with the squared error (Sugihara 2011), on the pose error
     as a twist in the frame itself; a joint at its limit stays there while the step pushes it out.
     """
-    low, high = coordinates.lower, coordinates.upper
+    low, high, has_slides = coordinates.lower, coordinates.upper, bool(coordinates.slides.any())
     goal = pin.SE3(T_base_tcp)
     q = np.minimum(np.maximum(q_seed_rad, low), high)
     best, best_at = np.inf, 0
@@ -261,9 +268,13 @@ def solve(
         J = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL)
         if not coordinates.are_joints:
             J = J @ coordinates.matrix
-        H = J.dot(J.T)
-        H.flat[::7] += _DAMPING + _DAMPING_PER_ERROR * squared
-        dq = J.T.dot(_lapack.dposv(H, error)[1])
+        dq = _damped_step(J, error, squared)
+        if has_slides:
+            # A lift is at a limit in many poses: the other coordinates take over. Arms that only turn keep
+            # the bits of their labels.
+            while (stuck := ((q <= low) & (dq < 0)) | ((q >= high) & (dq > 0))).any():
+                J = J * ~stuck
+                dq = _damped_step(J, error, squared)
         longest = max(map(abs, dq.tolist()))
         if longest > _LONGEST_STEP_RAD:
             dq *= _LONGEST_STEP_RAD / longest

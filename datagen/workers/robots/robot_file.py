@@ -103,8 +103,7 @@ class BaseKeys(_Section):
     height_m: Annotated[float, Field(ge=0, le=10)] | None = None  # of the mount above the floor
     # Where the base turns and (x, y) of candidates lies, in the frame of the arm's base link.
     mount_m: tuple[Length, Length] | None = None
-    presents: Literal["faces", "side", "turns"] = "faces"
-    angle_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0  # `side`: from the target to the base's x axis
+    presents: Literal["faces", "turns"] = "faces"
     range_deg: tuple[Annotated[float, Field(ge=-360, le=0)], Annotated[float, Field(ge=0, le=360)]] = (
         -180.0,
         180.0,

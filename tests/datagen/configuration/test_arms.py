@@ -26,6 +26,7 @@ from datagen.schemas.specification import (
     TrialParams,
 )
 from datagen.workers.robots import ROBOTS, robot_limits
+from tests.sim_extra import named_robots
 
 SOURCES = {"houses": {"kind": "a", "digest": "1" * 64}, "objects": {"kind": "b", "digest": "2" * 64}}
 
@@ -86,7 +87,7 @@ def test_the_robot_is_that_of_the_option_or_of_the_arm() -> None:
     assert robot_of({"arm": {"robot": "fetch"}}, "panda") == "panda"
 
 
-@pytest.mark.parametrize("robot", sorted(ROBOTS))
+@pytest.mark.parametrize("robot", named_robots())
 def test_narrowed_candidates_suit_the_robot(robot: str) -> None:
     fields: dict[str, Any] = {}
     narrow_candidates(fields, robot)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from datagen.configuration.specify import specify
+from datagen.configuration.toml_files import read_toml
 from datagen.schemas.errors import InputError
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
@@ -55,7 +56,13 @@ def test_scenes_with_a_required_set_have_a_version_of_their_own() -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["a." * 50_000 + "a = 1", "[" + "scene." * 50_000 + "a]", "a = " + "{a.a.a.a.a = " * 90 + "1" + "}" * 90],
+    [
+        "a." * 50_000 + "a = 1",
+        '"," . ' * 50_000 + "a = 1",
+        "[" + "scene." * 50_000 + "a]",
+        "a = " + f"{{{'a.' * 190}a = " * 90 + "1" + "}" * 90,
+    ],
+    ids=["key", "quoted", "table", "values"],
 )
 def test_deeply_nested_configurations_are_refused(text: str, tmp_path: Path) -> None:
     """The parser needs gigabytes for such keys, and messages cannot show what it reads."""
@@ -63,3 +70,10 @@ def test_deeply_nested_configurations_are_refused(text: str, tmp_path: Path) -> 
     config.write_text(text)
     with pytest.raises(InputError, match=r"run\.toml: is not TOML"):
         specify("heuristic", open_houses("builtin"), open_objects("builtin"), {}, config)
+
+
+def test_many_decimals_and_dots_in_text_are_no_deep_key(tmp_path: Path) -> None:
+    (file := tmp_path / "a.toml").write_text(
+        f'poses = [{"[0.25, -1.5], " * 300}]  # {"." * 500}\ntext = "{"a." * 500}"\n'
+    )
+    assert read_toml(file) == {"poses": [[0.25, -1.5]] * 300, "text": "a." * 500}

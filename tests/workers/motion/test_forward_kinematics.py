@@ -10,12 +10,10 @@ from datagen.workers.motion.planning_scene import moving_of
 from datagen.workers.motion.reach_table import reach_table
 from datagen.workers.robots.robot import Robot
 from tests.workers.motion.tables import arm
-from tests.workers.robots.robots_under_test import CASES, label_of, opened
-
-HIGHEST = {case[:2]: case for case in CASES}  # one of each robot and reach
+from tests.workers.robots.robots_under_test import CASES, opened
 
 
-@pytest.fixture(params=HIGHEST.values(), ids=label_of)
+@pytest.fixture(params=CASES)
 def robot(request: pytest.FixtureRequest) -> Robot:
     return opened(request.param)
 
@@ -64,7 +62,8 @@ def test_seeds_are_near_their_pose_and_differ(robot: Robot) -> None:
     np.testing.assert_array_equal(table.distance(T), [table.distance(T[k : k + 1])[0] for k in range(len(T))])
     np.testing.assert_array_equal(table.seeds(T, 1)[:, 0], seeds[:, 0])
     apart = np.abs(seeds[:, :, None] - seeds[:, None]).max(axis=3)[:, *np.triu_indices(4, 1)]
-    assert np.median(apart.min(axis=1)) > 0.35
+    # A lift, a telescope and a base that turns lead to most poses in one way alone.
+    assert np.median(apart.min(axis=1)) > (0.35 if robot.name == "stretch3" else 0.5)
     reached = kinematics.tcp(seeds.reshape(-1, seeds.shape[2]))
     gap_m = np.linalg.norm(reached[:, :3, 3] - np.repeat(T[:, :3, 3], 4, axis=0), axis=1)
     assert np.median(gap_m) < 0.25 * table.length_m

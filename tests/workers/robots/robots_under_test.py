@@ -16,7 +16,6 @@ Case = tuple[str, float | None, float]
 
 _SHARES_OF_REACH = (0.0, 0.1, 0.3, 0.65, 1.0)  # shares of the range of a robot that is scaled
 _ON_PEDESTAL_M = 0.8
-_MISSING = EXTRAS["robots"].missing()
 
 
 def cases_of(name: str) -> list[Case]:
@@ -35,7 +34,7 @@ def label_of(case: Case) -> str:
 
 
 def _params(name: str) -> list[Any]:
-    if "mani_skill" not in robot_source(name).keys.urdf and _MISSING:
+    if "mani_skill" not in robot_source(name).keys.urdf and EXTRAS["robots"].missing():
         return [pytest.param(None, id=name, marks=needs_robots)]
     return [pytest.param(case, id=label_of(case)) for case in cases_of(name)]
 

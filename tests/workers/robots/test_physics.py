@@ -105,4 +105,4 @@ def test_drives_hold_every_home(robot: Robot, payload_kg: float) -> None:
             hand.add_force_at_point(weight, tcp)
             simulated.scene.step()
         arm = [simulated.names.index(joint.name) for joint in robot.assembly.arm]
-        assert np.degrees(np.abs(simulated.body.qpos - q)[arm]).max() < 1.5
+        assert np.degrees(np.abs(simulated.body.qpos - q)[arm]).max() < 1.0
