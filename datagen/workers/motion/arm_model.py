@@ -10,12 +10,13 @@ import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from datagen.workers.geometry.mesh import F32, F64, I32
-from datagen.workers.motion.compiled.compiler import in_memory
-from datagen.workers.motion.compiled.contacts import Parts
-from datagen.workers.motion.compiled.reach_map import AZIMUTHS, CELLS, ReachMap, fill
-from datagen.workers.motion.compiled.search import FLOOR, Arm, Hand
+from datagen.workers.kinematics.compiler import in_memory
+from datagen.workers.kinematics.contacts import Parts
+from datagen.workers.kinematics.tree import Bools, Ints, KinematicTree
+from datagen.workers.motion.arm_motion import Arm
+from datagen.workers.motion.hand_motion import FLOOR, Hand
+from datagen.workers.motion.reach_map import AZIMUTHS, CELLS, ReachMap, fill
 from datagen.workers.robots.gripper import Gripper
-from datagen.workers.robots.kinematic_tree import Bools, Ints, KinematicTree
 from datagen.workers.robots.robot import Robot
 
 _SAMPLES = 1 << 19  # joint vectors of a reach map
@@ -57,7 +58,7 @@ def arm_of(robot: Robot, draw: int = 0) -> Arm:
     own = _own_parts(robot)
     arm = Arm(
         tree,
-        parts_of(_only(links, moves), [FLOOR * int(stands) for stands in robot.is_base[: len(links)]]),
+        parts_of(_only(links, moves), [int(FLOOR) * int(stands) for stands in robot.is_base[: len(links)]]),
         parts_of(_only(links, ~moves)),
         own,
         _pairs(own.owner, robot.self_pairs),

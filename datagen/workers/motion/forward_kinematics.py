@@ -8,8 +8,8 @@ import numpy as np
 
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
+from datagen.workers.kinematics.tree import KinematicTree, frame_poses
 from datagen.workers.motion.collision import Ints
-from datagen.workers.robots.kinematic_tree import KinematicTree, frame_poses
 from datagen.workers.robots.robot import Robot
 
 _MOVES = 1e-9

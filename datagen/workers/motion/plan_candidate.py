@@ -8,19 +8,34 @@ import numpy as np
 
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
+from datagen.workers.kinematics.compiler import in_memory
+from datagen.workers.kinematics.tree import Bools, Ints
 from datagen.workers.motion import MotionPlan, PlanReport
-from datagen.workers.motion.compiled import search as compiled
-from datagen.workers.motion.compiled.compiler import in_memory
+from datagen.workers.motion.arm_motion import Search, is_stuck, workspace
+from datagen.workers.motion.hand_motion import Poses, points_on
+from datagen.workers.motion.path_search import dense
 from datagen.workers.motion.planning_scene import ROOM_AROUND_M, PlanningScene
-from datagen.workers.robots.kinematic_tree import Bools
+from datagen.workers.motion.search import (
+    NO_APPROACH,
+    NO_LIFT,
+    NO_START,
+    SUCCESS,
+    length_and_clearance,
+    path_to,
+    samples_near,
+    try_pose,
+)
 
-# The order of checks of a grasp, cheap ones first. A later cause of failure means more progress.
 STAGES = ("no_ik", "arm_collision", "no_start", "no_approach", "no_lift", "no_path", "success")
-_NO_START, _NO_APPROACH, _NO_LIFT, _SUCCESS = 2, 3, 4, 6
+_SEARCHES = 4  # grasps for which a path is searched where no straight path is free
 _PORTION = 96  # poses ordered together at first; each further portion is as large as all before
 _SHORT = 8  # poses tried to tell a lift that is too far from no solution
 # The search near poses: poses in a round, the most that they are near, and those for which IK is tried.
 _NEARBY, _ORIGINS, _NEARBY_TRIED = 480, 24, 48
+# In each round and in all: a turn about the closing axis; tilts about the pads' width and the approach, within the
+# contacts' friction cone; shifts along them, by less than half a pad.
+_MOTION_STD = np.array([np.radians(20), np.radians(3), np.radians(3), 0.003, 0.003])
+_MOST_MOTION = np.array([np.inf, np.radians(8), np.radians(8), 0.006, 0.006])
 
 
 def plan_candidate(
@@ -37,9 +52,10 @@ def plan_candidate(
     if around.grasps_free == 0 or not allowed.any():
         return PlanReport("no_grasp", None, around.grasps_free, 0)
     search = _Search(prepared, np.ascontiguousarray(T_world_base[:3]), rng)
-    plan = _search_grasps(search, allowed)
-    if plan is None and search.furthest >= _NO_APPROACH:
-        plan = _search_nearby(search)
+    stages = dict[int, int]()
+    plan = _among_grasps(search, allowed, stages)
+    if plan is None and search.furthest >= NO_APPROACH:
+        plan = _near_grasps(search, _furthest(stages))
     outcome = STAGES[search.furthest] if plan is None else "success"
     return PlanReport(outcome, plan, around.grasps_free, search.tried)
 
@@ -53,10 +69,8 @@ class _Search:
     rng: np.random.Generator
     tried: int = 0  # poses for which inverse kinematics was tried
     furthest: int = 0  # stage
-    stages: dict[int, int] = field(default_factory=dict)  # the stage each pose reached, in this order
-    far: list[tuple[int, int]] = field(
-        default_factory=list
-    )  # row and opening of poses without a straight path
+    # The row (-1: none), pose and opening of each grasp without a straight path.
+    without_path: list[tuple[int, F64, int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         scene, around = self.scene, self.scene.around
@@ -64,29 +78,50 @@ class _Search:
         center_m = self.T_root[:, :3] @ scene.robot.shoulder_m + self.T_root[:, 3]
         is_near = (around.low_m <= center_m + reach_m) & (around.high_m >= center_m - reach_m)
         rows = np.flatnonzero(is_near.all(axis=1))
-        is_stuck = compiled.is_stuck(scene.arm, around.room, self.T_root, rows)
-        count, searches = len(scene.robot.joint_names), compiled.SEARCHES
-        self.filled, self.far_T = np.zeros(1, np.int64), np.empty((searches, 3, 4))
-        self.base = in_memory(
-            compiled.Base(
-                self.T_root, rows, np.zeros(len(scene.robot.homes_rad), np.int8),
-                self.far_T, np.empty((searches, 2, count)), self.filled, is_stuck,
-            )
-        )  # fmt: skip
-        self.at = (scene.arm, around.hand, around.room, scene.limits, self.base)
-        self.work, self.found = compiled.new_search(*self.at[:4])
+        at, limits, count = (scene.arm, around.hand, around.room), scene.limits, len(scene.robot.joint_names)
+        back, rise = (points_on(m, limits.line_step_m) for m in (limits.pregrasp_m, limits.lift_m))
+        self.back = np.empty((_SEARCHES + 1, back, count))  # lines of grasps, as `Work` has them
+        self.lift = np.empty((_SEARCHES + 1, rise, count))
+        self.found = np.zeros(1, np.int64)
+        work = workspace(*at, self.back, self.lift, self.found)
+        stuck = is_stuck(scene.arm, around.room, self.T_root, rows, work)
+        self.compiled = in_memory(Search(*at, scene.compiled_limits, self.T_root, rows, stuck, work))
 
-    def try_pose(self, row: int, T_world_tcp: F64, opening: int) -> tuple[int, MotionPlan | None]:
-        """The stage that a free pose (3, 4) of the hand leads to, and the plan where it is a success that holds."""
-        self.tried += 1
-        stage, home = compiled.try_pose(*self.at, T_world_tcp, opening, self.work, self.found)
-        self.furthest = max(self.furthest, min(stage, _SUCCESS - 1))
-        if self.filled[0] > len(self.far):
-            self.far += [(row, opening)] * (int(self.filled[0]) - len(self.far))
-        if stage < _SUCCESS or not self.holds(row, T_world_tcp, opening):
-            return min(stage, _SUCCESS - 1), None
-        path = compiled.straight_path(self.scene.arm, home, self.scene.limits, self.found)
-        return stage, self.plan(row, T_world_tcp, opening, home, path)
+    def best_first(self, poses: Poses, start: int, end: int, short: Ints) -> Ints:
+        """The free poses from `start` to `end` that can be reached, those with most samples near them first."""
+        near = np.zeros(end - start, np.int64)
+        samples_near(self.compiled, poses, start, end, near, short)
+        return start + np.argsort(-near, kind="stable")[: np.count_nonzero(near)]
+
+    def try_poses(self, poses: Poses, rows: Ints, of_grasps: bool, stages: dict[int, int]) -> MotionPlan | None:
+        """The plan of the first of these rows of the poses that has one; `stages` gets how far each came."""
+        for k in rows.tolist():
+            row, T, opening = k if of_grasps else -1, poses.T_world_tcp[k], int(poses.opening[k])
+            self.tried += 1
+            stage, home = try_pose(self.compiled, T, opening)
+            stages[k] = min(stage, SUCCESS - 1)
+            self.furthest = max(self.furthest, stages[k])
+            found = int(self.found[0])
+            if stage == SUCCESS and self.holds(row, T, opening):
+                corners = np.stack([self.scene.robot.homes_rad[home], self.back[found, -1]])
+                path = dense(self.scene.weight, corners, self.scene.limits.step)
+                return self.plan(found, row, T, opening, home, path)
+            self.without_path += [(row, T, opening)] * (found - len(self.without_path))
+            if self.furthest == NO_START:
+                return None
+        return None
+
+    def search_paths(self) -> MotionPlan | None:
+        """Search a path to the first grasps without a straight one; they share the iterations evenly."""
+        left = self.scene.params.path_iterations
+        for k, (row, T, opening) in enumerate(self.without_path):
+            share = left // (len(self.without_path) - k)
+            path, home, used = path_to(self.compiled, k, opening, share, self.rng)
+            left -= used
+            if len(path) and self.holds(row, T, opening):
+                return self.plan(k, row, T, opening, home, path)
+        self.without_path, self.found[0] = [], 0
+        return None
 
     def holds(self, row: int, T_world_tcp: F64, opening: int) -> bool:
         """Whether the hand holds the object at a pose; simulated on first use."""
@@ -104,87 +139,87 @@ class _Search:
         assert around.grasps.pose_score is not None
         return around.grasps.pose_score(T, float(around.opening_m[opening]))
 
-    def plan(self, row: int, T_world_tcp: F64, opening: int, home: int, q_reach: F64) -> MotionPlan:
-        """The whole plan with the lines that were found last."""
+    def plan(
+        self, found: int, row: int, T_world_tcp: F64, opening: int, home: int, q_reach: F64
+    ) -> MotionPlan:
+        """The whole plan along the lines `found`."""
         around = self.scene.around
-        lines = compiled.whole_plan(*self.at, opening, home, q_reach, self.found, self.work)
+        length, clearance_m = length_and_clearance(self.compiled, found, opening, q_reach)
         return MotionPlan(
             int(around.grasp[row]) if row >= 0 else -1,
             home,
-            *lines[:3],
+            q_reach,
+            self.back[found, ::-1].copy(),
+            self.lift[found].copy(),
             float(around.opening_m[opening]),
-            lines.length,
-            lines.clearance_m,
+            length,
+            clearance_m,
             self.score(row, T_world_tcp, opening),
         )
 
-    def search_paths(self) -> MotionPlan | None:
-        """Search a path to the first poses without a straight one; they share the iterations evenly."""
-        left = self.scene.params.path_iterations
-        for k, (row, opening) in enumerate(self.far):
-            share = left // (len(self.far) - k)
-            path, home, used = compiled.path_to(*self.at, k, opening, share, self.work, self.found, self.rng)
-            left -= used
-            T = self.far_T[k]
-            if len(path) and self.holds(row, T, opening):
-                return self.plan(row, T, opening, home, path)
-        return None
 
-    def forget_far(self) -> None:
-        """Begin a new list of poses without a straight path."""
-        self.far, self.filled[0] = [], 0
-
-
-def _search_grasps(search: _Search, allowed: Bools) -> MotionPlan | None:
+def _among_grasps(search: _Search, allowed: Bools, stages: dict[int, int]) -> MotionPlan | None:
     """Try the scene's poses, in portions of their order, in which neighbours differ much; best ones first."""
-    around, limits = search.scene.around, search.scene.params
-    poses = (
-        around.poses if allowed.all() else in_memory(around.arrays._replace(holds=np.where(allowed, 0, -1)))
-    )
-    short = np.full(_SHORT, -1)
-    start, end = 0, max(around.first, _PORTION)
-    while start < len(allowed) and search.tried < limits.max_grasps_tried:
-        rows = compiled.best_first(*search.at, poses, start, min(end, len(allowed)), short, search.work)
-        for k in rows[: limits.max_grasps_tried - search.tried].tolist():
-            plan = _try_row(search, k)
-            if plan is not None or search.furthest == _NO_START:
-                return plan
+    around, most = search.scene.around, search.scene.params.max_grasps_tried
+    arrays, poses = around.arrays, around.poses
+    if not allowed.all():
+        poses = in_memory(arrays._replace(allowed=allowed))
+    short, start, end = np.full(_SHORT, -1), 0, max(around.first, _PORTION)
+    while start < len(allowed) and search.tried < most and search.furthest != NO_START:
+        rows = search.best_first(poses, start, min(end, len(allowed)), short)
+        plan = search.try_poses(arrays, rows[: most - search.tried], True, stages)
+        if plan is not None:
+            return plan
         start, end = end, 2 * end
-    # They get no further than the lift.
-    for k in short[short >= 0].tolist():
-        if search.furthest < _NO_LIFT:
-            _try_row(search, k)
+    if NO_START != search.furthest < NO_LIFT:  # the others get no further than the lift
+        search.try_poses(arrays, short[short >= 0], True, stages)
     return search.search_paths()
 
 
-def _try_row(search: _Search, k: int) -> MotionPlan | None:
-    arrays = search.scene.around.arrays
-    stage, plan = search.try_pose(k, arrays.T_world_tcp[k], int(arrays.opening[k]))
-    search.stages[k] = stage
-    return plan
+def _furthest(stages: dict[int, int]) -> list[int]:
+    """The poses that came furthest, at most as many as the search near them begins with."""
+    return sorted(stages, key=lambda k: -stages[k])[:_ORIGINS]
 
 
-def _search_nearby(search: _Search) -> MotionPlan | None:
+def _near_grasps(search: _Search, rows: list[int]) -> MotionPlan | None:
     """Search near the poses that came furthest, then near the best poses found."""
     arrays = search.scene.around.arrays
-    rows = sorted(search.stages, key=lambda k: -search.stages[k])[:_ORIGINS]
     T, opening, motion = arrays.T_world_tcp[rows], arrays.opening[rows], np.zeros((len(rows), 5))
     for _ in range(search.scene.params.nearby_rounds or 0):
         if len(T) == 0:
             break
-        search.forget_far()
         each = _NEARBY // len(T)
-        T_near, moved, order = compiled.poses_near(
-            *search.at, T, motion, opening, each, search.work, search.rng
-        )
-        stages: dict[int, int] = {}
-        for k in order[:_NEARBY_TRIED].tolist():
-            stages[k], plan = search.try_pose(-1, T_near[k], int(opening[k // each]))
-            if plan is not None:
-                return plan
-        plan = search.search_paths()
+        T, opening, motion = (np.repeat(a, each, axis=0) for a in (T, opening, motion))
+        T, motion = _varied(T, motion, search.rng)
+        poses, stages = Poses.unknown(T, opening), dict[int, int]()
+        order = search.best_first(in_memory(poses), 0, len(T), np.full(0, -1))
+        plan = search.try_poses(poses, order[:_NEARBY_TRIED], False, stages) or search.search_paths()
         if plan is not None:
             return plan
-        best = np.array(sorted(stages, key=lambda k: -stages[k])[:_ORIGINS], np.int64)
-        T, motion, opening = T[best // each], moved[best], opening[best // each]
+        rows = _furthest(stages)
+        T, opening, motion = T[rows], opening[rows], motion[rows]
     return None
+
+
+def _varied(T: F64, motion: F64, rng: np.random.Generator) -> tuple[F64, F64]:
+    """Poses (N, 3, 4) and motions (N, 5): random ones near the given motions of grasps, each in its own frame.
+
+    A motion is a turn about y, tilts about x and z, shifts along x and z. Both fingers keep their contacts, so
+    that most of these poses hold the object as the grasp does.
+    """
+    motion = motion + rng.standard_normal(motion.shape) * _MOTION_STD
+    motion = np.clip(motion, -_MOST_MOTION, _MOST_MOTION)
+    R = T[:, :, :3]
+    shift_m = np.einsum("nij,nj->ni", R[:, :, [0, 2]], motion[:, 3:])
+    for axis, angle_rad in zip((1, 0, 2), motion[:, :3].T, strict=True):
+        R = np.matmul(R, _rotations(axis, angle_rad))
+    return np.concatenate([R, (T[:, :, 3] + shift_m)[:, :, None]], axis=2), motion
+
+
+def _rotations(axis: int, angle_rad: F64) -> F64:
+    """Rotations (N, 3, 3) about one axis of the frame by angles (N,)."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R = np.tile(np.eye(3), (len(angle_rad), 1, 1))
+    R[:, i, i], R[:, i, j], R[:, j, i], R[:, j, j] = c, -s, s, c
+    return R

@@ -13,13 +13,14 @@ from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.grasps.grasp_cache import GraspSet
 from datagen.workers.houses.house import House
+from datagen.workers.kinematics.compiler import in_memory
+from datagen.workers.kinematics.contacts import Parts, Still, hit_any
+from datagen.workers.kinematics.tree import Ints
 from datagen.workers.motion.arm_model import TOUCH_M, arm_of, core_of, hand_of, on_pedestal, parts_of
-from datagen.workers.motion.compiled.compiler import in_memory
-from datagen.workers.motion.compiled.contacts import Parts, Still, hit_any
-from datagen.workers.motion.compiled.search import (
+from datagen.workers.motion.arm_motion import Arm
+from datagen.workers.motion.hand_motion import (
     FLOOR,
     TARGET,
-    Arm,
     Hand,
     Limits,
     Poses,
@@ -29,7 +30,6 @@ from datagen.workers.motion.compiled.search import (
 )
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.gripper import Gripper
-from datagen.workers.robots.kinematic_tree import Ints
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes import SettledScene
 
@@ -78,7 +78,9 @@ class PlanningScene:
     robot: Robot
     params: MotionParams
     limits: Limits
-    arm: Arm
+    weight: F64  # (A,), radians that a unit of each coordinate counts as
+    arm: Arm  # in memory, as are these limits
+    compiled_limits: Limits
     around: HandScene
 
     @property
@@ -109,7 +111,9 @@ def prepare(
     key = (robot.gripper.digest, grasps, params, per_scene, around_m)
     if key not in known:
         known[key] = hand_scene(scene, robot.gripper, grasps, limits, per_scene, around_m)
-    return PlanningScene(robot, params, in_memory(limits), in_memory(arm), known[key])
+    return PlanningScene(
+        robot, params, limits, arm.weight, in_memory(arm), in_memory(limits), known[key]
+    )
 
 
 # By scene, for as long as it lives. The key holds the GraspSet, so that its id is not used again.
@@ -129,8 +133,6 @@ def limits_of(params: MotionParams) -> Limits:
         params.margin_m,
         _HAND_MARGIN_M,
         _IK_SLACK_M,
-        params.max_grasps_tried,
-        params.path_iterations,
     )
 
 
@@ -145,7 +147,7 @@ def hand_scene(
     static, floor = _static_around(scene, around_m)
     objects = [_placed(m, T) for m, T in zip(scene.models, scene.T_world_object, strict=True)]
     others = [part for parts in objects[1:] for part in parts]
-    kinds = [FLOOR * int(f) for f in floor] + [TARGET] * len(objects[0]) + [0] * len(others)
+    kinds = [int(FLOOR) * f for f in floor] + [int(TARGET)] * len(objects[0]) + [0] * len(others)
     still = still_of([*static, *objects[0], *others], kinds)
     # The hand is never farther from the target than this: the other parts need no check.
     center, room_m = scene.target_center_m, _HAND_ROOM_M + max(limits.pregrasp_m, limits.lift_m)
@@ -161,8 +163,8 @@ def hand_scene(
     ):
         grasp, T_object_tcp, opening, first = grasp[:0], T_object_tcp[:0], opening[:0], 0
     T_world_tcp = np.ascontiguousarray(np.matmul(T_world_target, T_object_tcp)[:, :3])
-    holds = np.array([1 if k < len(grasps.score) else 0 for k in grasp.tolist()], np.int8)
-    poses = Poses(T_world_tcp, opening, np.ones(len(grasp), np.int8), np.zeros(len(grasp), np.int8), holds)
+    poses = Poses.unknown(T_world_tcp, opening)
+    poses.clears[:] = 1
     checked = (hand, room, in_memory(limits), in_memory(poses))
     if free_poses(*checked, 0, first) == 0:
         free_poses(*checked, first, len(grasp))
@@ -203,7 +205,7 @@ def _clear_poses(
         grasp = np.repeat(np.arange(len(grasps)), 2)
         T = np.repeat(grasps.T_object_tcp, 2, axis=0)
         T[1::2] = T[1::2] @ _HALF_TURN
-        still = still_of(target.convex_parts_m, [TARGET] * len(target.convex_parts_m))
+        still = still_of(target.convex_parts_m, [int(TARGET)] * len(target.convex_parts_m))
         opening = rows[grasp].astype(np.int64)
         room = in_memory(Room(still, np.arange(len(still.kind))))
         ok = clear_poses(hand, room, in_memory(limits), np.ascontiguousarray(T[:, :3]), opening)

@@ -11,10 +11,10 @@ from datagen.schemas.identity import digest_of
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import inverse
+from datagen.workers.kinematics.tree import Bools, Ints, KinematicTree
 from datagen.workers.robots.arm_chain import TURN, ArmChain
 from datagen.workers.robots.base import Base, base_of
 from datagen.workers.robots.hand import Hand, hand_of
-from datagen.workers.robots.kinematic_tree import Bools, Ints, KinematicTree
 from datagen.workers.robots.links import (
     LinkBody,
     body_of,

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.robots.kinematic_tree import Ints, KinematicTree, frame_poses
+from datagen.workers.kinematics.tree import Ints, KinematicTree, frame_poses
 
 Parts = tuple[F32, ...]  # convex parts, each (V, 3)
 _Y = np.array([0.0, 1.0, 0.0], np.float32)

@@ -9,9 +9,9 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.kinematics.tree import KinematicTree
 from datagen.workers.robots.gripper import Gripper
 from datagen.workers.robots.hand_measures import Fingers, HandMeasures
-from datagen.workers.robots.kinematic_tree import KinematicTree
 from datagen.workers.robots.links import Cluster, LinkBody, body_of, cluster_of
 from datagen.workers.robots.robot_file import RobotSource
 from datagen.workers.robots.urdf import Joint, UrdfTree

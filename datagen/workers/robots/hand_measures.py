@@ -10,8 +10,8 @@ from scipy.spatial import ConvexHull
 from datagen.schemas.identity import digest_of
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import inverse
+from datagen.workers.kinematics.tree import Ints, KinematicTree, frame_poses
 from datagen.workers.robots.gripper import Gripper, Linkage, Parts
-from datagen.workers.robots.kinematic_tree import Ints, KinematicTree, frame_poses
 from datagen.workers.robots.robot_file import RobotSource
 
 _SNAP = np.cos(np.radians(15))  # directions nearer than this to an axis of the palm are that axis

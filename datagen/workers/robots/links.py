@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.kinematics.tree import joint_motion
 from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.hulls import shape_parts
-from datagen.workers.robots.kinematic_tree import joint_motion
 from datagen.workers.robots.urdf import Inertial, Joint, Link, Shape, UrdfTree, scaled_inertial
 
 

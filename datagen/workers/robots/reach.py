@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.robots.kinematic_tree import KinematicTree, frame_poses
+from datagen.workers.kinematics.tree import KinematicTree, frame_poses
 
 _STARTS = 32
 _SWEEPS = 200

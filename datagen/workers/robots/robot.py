@@ -17,11 +17,11 @@ from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import F32, F64, Mesh, concatenate
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.houses.glb import read_glb
+from datagen.workers.kinematics.tree import Coordinates, KinematicTree
 from datagen.workers.robots.arm_chain import TURN
 from datagen.workers.robots.assembly import assemble
 from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.hulls import hull_faces
-from datagen.workers.robots.kinematic_tree import Coordinates, KinematicTree
 from datagen.workers.robots.links import LinkBody
 from datagen.workers.robots.robot_file import RobotSource
 from datagen.workers.robots.self_collision import SelfCollision

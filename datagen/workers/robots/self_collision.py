@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio
 
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.kinematics.tree import Coordinates
 from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.hulls import polyhedron
-from datagen.workers.robots.kinematic_tree import Coordinates
 
 # Its binary module has no types.
 pin: Any = pinocchio

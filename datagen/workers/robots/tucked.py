@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.kinematics.tree import KinematicTree, frame_poses
 from datagen.workers.robots.gripper import Parts
-from datagen.workers.robots.kinematic_tree import KinematicTree, frame_poses
 
 _LOOKED_AT, _BEST, _STEPS = 6000, 400, 6
 _POSES, _LEAST_APART_RAD = 8, 0.7

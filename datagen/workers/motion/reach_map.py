@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from datagen.workers.geometry.mesh import F32, F64, I32
-from datagen.workers.motion.compiled.compiler import compiled, struct
-from datagen.workers.motion.compiled.kinematics import joint_poses, tcp_pose
-from datagen.workers.robots.kinematic_tree import Ints, KinematicTree
+from datagen.workers.kinematics.compiler import compiled, struct
+from datagen.workers.kinematics.inverse import joint_poses, tcp_pose
+from datagen.workers.kinematics.tree import Ints, KinematicTree
 
 _DISTANCES, _HEIGHTS, _SIDES, _ROLLS, AZIMUTHS = 16, 32, 3, 8, 12
 _DIRECTIONS = 6 * _SIDES * _SIDES  # cells on the faces of a cube
@@ -35,6 +35,31 @@ class ReachMap(NamedTuple):
 
 
 struct(ReachMap)
+
+
+class ReachWork(NamedTuple):
+    """Arrays that `score` and `seeds` write into."""
+
+    local: F64  # (3, 4), for the caller: a pose in the base frame
+    cells: Ints  # (7,)
+    feature: F64  # (8,)
+    near: F64  # (24, A)
+    gap: F64  # (24,)
+
+
+new_reach_work = struct(ReachWork)
+
+
+@compiled
+def reach_workspace(coordinates: int) -> ReachWork:
+    """Arrays for so many coordinates."""
+    return new_reach_work(
+        np.empty((3, 4)),
+        np.empty(7, np.int64),
+        np.empty(8),
+        np.empty((_MOST_NEAR, coordinates)),
+        np.empty(_MOST_NEAR),
+    )
 
 
 @compiled
@@ -93,7 +118,8 @@ def cells_near(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> float:
     """
     azimuth = _feature(reach, T, feature)
     turns = reach.turn >= 0
-    cells[:] = -1
+    for k in range(7):
+        cells[k] = -1
     distance, height = feature[0], feature[1]
     if distance > 1 + 1 / _DISTANCES or abs(height) > 1 + 2 / _HEIGHTS:
         return azimuth
@@ -116,10 +142,10 @@ def cells_near(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> float:
 
 
 @compiled
-def score(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> int:
+def score(reach: ReachMap, T: F64, w: ReachWork) -> int:
     """How many samples lie near a TCP pose (3, 4) in the base frame: those of its own cell count eight times."""
-    cells_near(reach, T, cells, feature)
-    total, first = 0, reach.first
+    cells_near(reach, T, w.cells, w.feature)
+    total, first, cells = 0, reach.first, w.cells
     for k in range(7):
         if cells[k] >= 0:
             total += (8 if k == 0 else 1) * (first[cells[k] + 1] - first[cells[k]])
@@ -127,15 +153,14 @@ def score(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> int:
 
 
 @compiled
-def seeds(
-    reach: ReachMap, tree: KinematicTree, T: F64, out: F64, cells: Ints, feature: F64, near: F64, gap: F64
-) -> int:
+def seeds(reach: ReachMap, tree: KinematicTree, T: F64, out: F64, w: ReachWork) -> int:
     """Joint vectors (S, A) of samples near a TCP pose (3, 4) that differ from each other; how many were found.
 
     Each further one is the first that differs from those before by 1 in some coordinate, or where there is none
-    the one that differs most. `near` (24, A) and `gap` (24,) are scratch.
+    the one that differs most.
     """
-    azimuth = cells_near(reach, T, cells, feature)
+    cells, near, gap = w.cells, w.near, w.gap
+    azimuth = cells_near(reach, T, cells, w.feature)
     count, n = out.shape[1], 0
     for k in range(7):
         if cells[k] < 0 or n == len(near):

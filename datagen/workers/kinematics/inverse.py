@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.motion.compiled.compiler import compiled, struct
-from datagen.workers.robots.kinematic_tree import KinematicTree
+from datagen.workers.kinematics.compiler import compiled, struct
+from datagen.workers.kinematics.tree import KinematicTree
 
 POSITION_TOLERANCE_M = 0.0005
 ANGLE_TOLERANCE_RAD = math.radians(0.5)
@@ -37,6 +37,21 @@ class IkWork(NamedTuple):
 
 new_ik_work = struct(IkWork)
 struct(KinematicTree)
+
+
+@compiled
+def put(A: F64, out: F64) -> None:
+    """out = A for matrices; assigning them would compile NumPy's messages too."""
+    for i in range(len(A)):
+        for k in range(A.shape[1]):
+            out[i, k] = A[i, k]
+
+
+@compiled
+def put_row(a: F64, out: F64) -> None:
+    """out = a for vectors."""
+    for i in range(len(a)):
+        out[i] = a[i]
 
 
 @compiled
@@ -124,7 +139,9 @@ def pose_error(T: F64, goal: F64, out: F64) -> None:
 @compiled
 def tcp_jacobian(tree: KinematicTree, joints: F64, T: F64, out: F64) -> None:
     """Jacobian (A, 6), one row a coordinate: twist of the TCP at T in its own frame."""
-    out[:] = 0.0
+    for k in range(len(out)):
+        for i in range(6):
+            out[k, i] = 0.0
     j = tree.frame_joint[-1]
     while j >= 0:
         P = joints[j]

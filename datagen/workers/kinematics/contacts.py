@@ -12,11 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.motion.compiled.compiler import compiled, struct
-from datagen.workers.robots.kinematic_tree import Ints
+from datagen.workers.kinematics.compiler import compiled, struct
+from datagen.workers.kinematics.tree import Ints
 
 _MAX_STEPS = 100
 _CONVERGED = 1e-12  # relative, of the squared distance
+# NumPy's integers: machine code would be made again for each plain constant.
+_ONE_SHAPE, _NOTHING, _NONE = np.int64(0), np.int64(0), np.int64(-1)
 _TOUCHING = 1e-20  # squared distance (m^2) that counts as none
 
 
@@ -199,7 +201,7 @@ def gap_m(A: F64, T: F64, B: F64, near_m: float, far_m: float, axis: F64, W: F64
                 break
         W[n, 0], W[n, 1], W[n, 2] = x, y, z
         n = _closest(W, n + 1, v)
-        before, squared = squared, v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+        squared = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
         if n == 4 or squared <= near_m * near_m or squared <= _TOUCHING:
             axis[0] = axis[1] = axis[2] = 0.0
             return math.sqrt(squared)
@@ -403,7 +405,7 @@ def smallest_gap_m(
     With `nearest_only` the distance of the two parts whose boxes are nearest: an upper bound.
     """
     best, bound = far_m, far_m * far_m
-    one, other = -1, -1
+    one, other = _NONE, _NONE
     _boxes(parts, shape, T, 0.0, s)
     lows, highs, kinds, centers, halves = still.low_m, still.high_m, still.kind, s.center_m, s.half_m
     for p in range(len(parts.owner)):
@@ -432,14 +434,14 @@ def hit_any(parts: Parts, T: F64, still: Still, rows: Ints) -> bool:
     """Whether the parts touch a still part of `rows` at any of the poses T (N, O, 3, 4) of their owners."""
     s = scratch_of(len(parts.owner), len(still.kind))
     for k in range(len(T)):
-        if hits_still(parts, 0, T[k], still, rows, 0, 0.0, s):
+        if hits_still(parts, _ONE_SHAPE, T[k], still, rows, _NOTHING, 0.0, s):
             return True
     return False
 
 
 @compiled
 def radii_m(parts: Parts, out: F64) -> None:
-    """Radii (P,) of the parts around their boxes' centres."""
+    """Radii of the parts around their boxes' centres, into the first column of out (P, 3)."""
     for p in range(len(parts.owner)):
         most = 0.0
         for v in range(parts.first[p], parts.first[p + 1]):
@@ -447,4 +449,4 @@ def radii_m(parts: Parts, out: F64) -> None:
             for i in range(3):
                 squared += (parts.points_m[v, i] - parts.center_m[p, i]) ** 2
             most = max(most, squared)
-        out[p] = math.sqrt(most)
+        out[p, 0] = math.sqrt(most)

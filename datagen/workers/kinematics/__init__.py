@@ -1,0 +1,1 @@
+"""How bodies on trees of joints move, reach and touch, in machine code."""

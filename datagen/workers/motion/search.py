@@ -1,0 +1,187 @@
+"""Search for a whole plan from one base pose, compiled: hand, inverse kinematics, lines, paths.
+
+The same checks in the same order for every candidate; all random numbers come from the generator given.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.kinematics.compiler import compiled
+from datagen.workers.kinematics.contacts import smallest_gap_m
+from datagen.workers.kinematics.inverse import put, put_row, solve
+from datagen.workers.kinematics.tree import Ints
+from datagen.workers.motion.arm_motion import (
+    NO_HAND,
+    NO_HOME,
+    ONE_SHAPE,
+    Search,
+    follow,
+    has_free_home,
+    is_blocked,
+    is_line_free,
+    length,
+    next_home,
+    pose_arm,
+)
+from datagen.workers.motion.hand_motion import NOTHING, TARGET, Poses, is_hand_free, moved
+from datagen.workers.motion.path_search import connect, dense, shortened
+from datagen.workers.motion.reach_map import score, seeds
+
+# The order of checks of a grasp, cheap ones first. A later cause of failure means more progress.
+NO_IK, ARM_COLLISION, NO_START, NO_APPROACH, NO_LIFT, NO_PATH, SUCCESS = range(7)
+_STARTS = 3  # tucked poses from which a straight line is tried
+_CLEARANCE_POSES = 8
+_SAME = 0.05  # solutions of one pose that differ by less count as one
+_FAR_M = 1.0  # larger clearances are not computed
+
+
+@compiled
+def _inverse_times(A: F64, B: F64, out: F64) -> None:
+    """out = inverse(A) B for poses (3, 4)."""
+    for i in range(3):
+        for k in range(4):
+            total = 0.0
+            for m in range(3):
+                total += A[m, i] * (B[m, k] - (A[m, 3] if k == 3 else 0.0))
+            out[i, k] = total
+
+
+@compiled
+def samples_near(s: Search, poses: Poses, start: int, end: int, near: Ints, short: Ints) -> None:
+    """Samples of the reach map near poses `start` to `end` that are free, into near (end - start,); 0 elsewhere.
+
+    The least of those near the pose, near its pregrasp and near the end of its lift. Poses that can be reached
+    and not lifted go to `short`, behind those that are there, while there is room.
+    """
+    limits = s.limits
+    pose, local, work = np.empty((3, 4)), s.work.reach.local, s.work.reach
+    for k in range(start, end):
+        if not poses.allowed[k]:
+            continue
+        count = 1
+        for place in range(3):  # the grasp, its pregrasp, the end of the lift
+            moved(
+                poses.T_world_tcp[k],
+                limits.pregrasp_m if place == 1 else 0.0,
+                limits.lift_m if place == 2 else 0.0,
+                pose,
+            )
+            _inverse_times(s.T_root, pose, local)
+            here = score(s.arm.reach, local, work)
+            count = here if place == 0 else min(count, here)
+            if count == 0:
+                break
+        if (count == 0 and place < 2) or not is_hand_free(s.hand, s.room, limits, poses, k, s.work.hand):
+            continue
+        near[k - start] = count
+        if count == 0:
+            for m in range(len(short)):
+                if short[m] < 0:
+                    short[m] = k
+                    break
+
+
+@compiled
+def try_pose(s: Search, T: F64, opening: int) -> tuple[int, int]:
+    """The furthest stage that a free pose of the hand (3, 4) leads to, and the tucked pose it is reached from.
+
+    Cheap checks come first. The work gets the lines of a success, and those of a pose without a straight path.
+    """
+    arm, limits, w, T_root = s.arm, s.limits, s.work, s.T_root
+    tree, count, stage, ways = arm.tree, len(arm.weight), NO_IK, 0
+    pregrasp, lifted, q = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, count))
+    _inverse_times(T_root, T, w.reach.local)
+    moved(T, limits.pregrasp_m, 0.0, pregrasp)
+    moved(T, 0.0, limits.lift_m, lifted)
+    starts, known = np.empty((limits.seeds, count)), np.empty((limits.seeds, count))
+    for k in range(seeds(arm.reach, tree, w.reach.local, starts, w.reach)):
+        put_row(starts[k], q[0])
+        if not solve(tree, T_root, T, q[0], w.ik):
+            continue
+        is_known = False
+        for other in range(ways):
+            apart = 0.0
+            for m in range(count):
+                apart = max(apart, abs(q[0, m] - known[other, m]))
+            is_known |= apart < _SAME
+        if is_known:
+            continue
+        put_row(q[0], known[ways])
+        ways += 1
+        put_row(q[0], q[1])
+        if not solve(tree, T_root, pregrasp, q[1], w.ik):
+            continue
+        stage = max(stage, ARM_COLLISION)
+        if s.is_stuck:
+            return stage, -1
+        if is_blocked(s, q[1], opening, NOTHING) or is_blocked(s, q[0], NO_HAND, NOTHING):
+            continue
+        if not has_free_home(s):
+            return NO_START, -1
+        stage = max(stage, NO_APPROACH)
+        # The end of the lift is checked first: where the arm is too short for it, the lines cost most.
+        put_row(q[0], q[2])
+        if not solve(tree, T_root, lifted, q[2], w.ik):
+            stage = max(stage, NO_LIFT)
+            continue
+        at = w.without_path[0]
+        back, lift = w.back[at], w.lift[at]
+        put_row(q[0], back[0])
+        put_row(q[1], back[-1])
+        put_row(q[0], lift[0])
+        if not follow(s, T, limits.pregrasp_m, 0.0, NOTHING, back):
+            continue
+        stage = max(stage, NO_LIFT)
+        if not follow(s, T, 0.0, limits.lift_m, TARGET, lift):
+            continue
+        stage = max(stage, NO_PATH)
+        home = NO_HOME
+        for _ in range(_STARTS):
+            home = next_home(s, q[1], home)
+            if home < 0:
+                break
+            if is_line_free(s, arm.homes[home], q[1], opening, NOTHING):
+                return SUCCESS, home
+        w.without_path[0] = min(at + 1, len(w.back) - 1)
+    return stage, -1
+
+
+@compiled
+def path_to(s: Search, k: int, opening: int, iterations: int, rng: np.random.Generator) -> tuple[F64, int, int]:
+    """A free path (M, A) to grasp `k` of those without a straight one, its tucked pose, and the samples used.
+
+    M is 0 where none was found.
+    """
+    arm, q_pregrasp = s.arm, s.work.back[k, -1]
+    home = next_home(s, q_pregrasp, NO_HOME)
+    corners, used = connect(s, opening, arm.homes[home], q_pregrasp, iterations, rng)
+    if len(corners) > 0:
+        corners = shortened(s, opening, dense(arm.weight, corners, s.limits.step), rng)
+    return corners, home, used
+
+
+@compiled
+def length_and_clearance(s: Search, k: int, opening: int, q_reach: F64) -> tuple[float, float]:
+    """Radians of a path (M, A) and the approach to grasp `k`, and the smallest distance (m) of arm and scene.
+
+    The distance is that at 8 rows of the path, at most 1 m.
+    """
+    total, back, w = 0.0, s.work.back[k], s.work
+    for row in range(1, len(q_reach)):
+        total += length(s.arm.weight, q_reach[row - 1], q_reach[row])
+    for row in range(1, len(back)):
+        total += length(s.arm.weight, back[row - 1], back[row])
+    clearance_m, some, still, hand = _FAR_M, min(_CLEARANCE_POSES, len(q_reach)), s.room.still, w.hand
+    for look in range(2):  # first the parts whose boxes are nearest: then few others need a distance
+        for row in range(some):
+            pose_arm(s, q_reach[int(round(row * (len(q_reach) - 1) / max(some - 1, 1)))])
+            put(w.frames[-2], hand.frame[0])
+            clearance_m = smallest_gap_m(
+                s.hand.whole, opening, hand.frame, still, s.rows, look == 0, clearance_m, hand.whole
+            )
+            clearance_m = smallest_gap_m(
+                s.arm.body, ONE_SHAPE, w.frames, still, s.rows, look == 0, clearance_m, w.body
+            )
+    return total, clearance_m
