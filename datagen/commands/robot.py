@@ -10,8 +10,8 @@ import numpy as np
 from datagen.console.options import refuse_output
 from datagen.console.printing import print_rows
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.robots import open_robot, robot_digest, robot_limits
 from datagen.workers.kinematics.tree import frame_poses
+from datagen.workers.robots import open_robot, robot_digest, robot_limits
 from datagen.workers.robots.robot import Robot
 
 _POSES, _SEEDS = 200, 8  # of the measurement of inverse kinematics

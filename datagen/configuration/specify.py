@@ -52,6 +52,7 @@ _SHARDS, _SHARDS_AT_LEAST = 64, 8
 # Core seconds of a label, scene included, and bytes of a cloud's point (docs/results/speed.md).
 _LABEL_S = {"heuristic": 0.002, "plan": 0.03, "sim": 0.1}
 _POINT_BYTES = 10
+_NEARBY_ROUNDS = 3  # of the search near failed grasps
 
 
 def specify(
@@ -223,6 +224,9 @@ def complete_arm(
         is_known = robot is None and "robot_digest" in arm
         key = f"{named}@{arm['robot_digest']}" if is_known else named
         put_robot(arm, key, f"{place}: arm.robot" if robot is None else "--robot")
+    motion = arm.setdefault("motion", {})
+    if isinstance(motion, dict):
+        motion.setdefault("nearby_rounds", _NEARBY_ROUNDS)
     if label_source == "sim":
         arm.setdefault("trial", {})
     if repeats is not None:

@@ -106,7 +106,7 @@ def checks() -> Iterator[Check]:
     if find_spec("ray"):
         yield Check("ray", partial(_probe, engines.RAY), f"{_AGAIN} ray; or use --workers 0.")
     if not EXTRAS["sim"].missing():
-        again = f"{_AGAIN} pin coal mani-skill"
+        again = f"{_AGAIN} numba coal mani-skill"
         yield Check(
             "arm libraries", partial(_probe, engines.LIBRARIES), f"Plan and sim labels need them. {again}"
         )

@@ -61,16 +61,15 @@ print("ray " + ray.__version__)
 """
 LIBRARIES = """
 import importlib, importlib.metadata, importlib.util
-pinocchio = importlib.import_module("pinocchio")
+numba = importlib.import_module("numba")
 coal = importlib.import_module("coal")
-model = pinocchio.buildSampleModelManipulator()
-pinocchio.forwardKinematics(model, model.createData(), pinocchio.neutral(model))
+assert numba.njit(lambda a, b: a + b)(1.0, 2.0) == 3.0, "machine code adds wrongly"
 near, far = coal.Transform3s(), coal.Transform3s()
 far.setTranslation(importlib.import_module("numpy").array([3.0, 0.0, 0.0]))
 ball = coal.Sphere(1.0)
 hits = lambda other: coal.collide(ball, near, ball, other, coal.CollisionRequest(), coal.CollisionResult())
 assert hits(near) and not hits(far), "the collision check of two balls is wrong"
-print("pinocchio " + pinocchio.__version__ + ", coal " + importlib.metadata.version("coal"))
+print("numba " + numba.__version__ + ", coal " + importlib.metadata.version("coal"))
 """
 ROBOT = """
 from datagen.workers.robots import open_robot, robot_limits

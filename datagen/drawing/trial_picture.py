@@ -20,7 +20,7 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.labels.arm_labelling import CandidateTrial, arm_in_scene, try_candidate
 from datagen.workers.motion import MotionPlan
-from datagen.workers.motion.rrt_connect import dense
+from datagen.workers.motion.path_search import dense
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes import SettledScene
 from datagen.workers.scenes.reconstruct import reconstruct_candidates
@@ -111,7 +111,7 @@ def planned_motion(robot: Robot, plan: MotionPlan, T_world_base: F64, T_world_ob
     q, phases = [plan.q_reach_rad[:1]], ["reach"]
     paths = {"reach": plan.q_reach_rad, "approach": plan.q_approach_rad, "lift": plan.q_lift_rad}
     for phase, path in paths.items():
-        q.append(dense(path, _STEP_RAD)[1:])
+        q.append(dense(np.ones(path.shape[1]), path, _STEP_RAD)[1:])
         phases += [phase] * len(q[-1])
     q_rad = np.concatenate(q)
     poses = np.tile(T_world_object, (len(q_rad), 1, 1, 1))

@@ -156,8 +156,9 @@ class MotionParams(_Frozen):
     # Counts, not times: labels must not depend on the speed of a machine. Both are per candidate.
     max_grasps_tried: int = Field(default=150, ge=1, le=10_000)
     path_iterations: int = Field(default=200, ge=1, le=1_000_000)
-    # Rounds of a search near the grasps that came furthest, where none has a plan; None: no such search.
-    nearby_rounds: int | None = Field(default=None, ge=1, le=100)
+    # Rounds of a search near the grasps that came furthest, where none has a plan. None, in specifications
+    # older than label version 4: no such search.
+    nearby_rounds: int | None = Field(default=None, ge=0, le=100)
     # Distance of the arm from all obstacles, and of the hand up to the pregrasp.
     margin_m: float = Field(default=0.005, ge=0, le=0.2)
 

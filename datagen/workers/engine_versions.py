@@ -15,8 +15,8 @@ from datagen.workers.scenes import scenes_version
 _ENGINE_PACKAGES = {"sapien": "sapien", "pybullet": "pybullet", "embree": "embreex"}
 # Label sources that move an arm, and the distributions whose version can change bits of their labels.
 ARM_PACKAGES: dict[str, tuple[str, ...]] = {
-    "plan": ("coal", "mani_skill", "pin", "sapien"),
-    "sim": ("coal", "mani_skill", "pin", "sapien"),
+    "plan": ("coal", "mani_skill", "numba", "sapien"),
+    "sim": ("coal", "mani_skill", "numba", "sapien"),
 }
 
 

@@ -45,7 +45,7 @@ EXTRAS: dict[str, Extra] = {
         "heuristic labels; show, relabel, verify --replay",
         {"embreex": "embreex", "sapien": "sapien", "trimesh": "trimesh", **_PICTURES},
     ),
-    "sim": Extra("plan and sim labels", {"coal": "coal", "pinocchio": "pin", "mani_skill": "mani-skill"}),
+    "sim": Extra("plan and sim labels", {"coal": "coal", "numba": "numba", "mani_skill": "mani-skill"}),
     "robots": Extra(
         "robots stretch3, tiago-pro, ur5 and pr2; meshes in COLLADA",
         {

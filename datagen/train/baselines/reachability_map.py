@@ -15,6 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from datagen.train.inputs import F32, F64, Bools
+from datagen.workers.kinematics.tree import frame_poses
 from datagen.workers.robots import open_robot, robot_limits
 from datagen.workers.robots.gripper import Gripper
 
@@ -70,19 +71,15 @@ def reachability_map(robot: str, reach_m: float) -> ReachabilityMap:
 
 @lru_cache(maxsize=32)
 def _map(name: str, reach_m: float | None) -> ReachabilityMap:
-    # Of the extra sim, which no other method needs.
-    from datagen.workers.motion.forward_kinematics import forward_kinematics
-
     heights = robot_limits(name).base_height_m
     robot = open_robot(name, reach_m, heights[0] if heights else 0.0)
-    kinematics = forward_kinematics(robot)
     lower, upper = np.maximum(robot.q_lower_rad, -np.pi), np.minimum(robot.q_upper_rad, np.pi)
     rng = np.random.default_rng(_SEED)
     lowest = float(robot.shoulder_m[2]) / robot.reach_m - 1
     size = (_CELLS_PER_REACH, 2 * _CELLS_PER_REACH, LEVELS, AZIMUTHS)
     count = np.zeros(size, np.int64)
     for _ in range(_SAMPLES // _AT_ONCE):
-        T = kinematics.tcp(rng.uniform(lower, upper, (_AT_ONCE, len(lower))))
+        T = frame_poses(robot.tree, rng.uniform(lower, upper, (_AT_ONCE, len(lower))), tcp_only=True)[:, 0]
         x, y, z = (T[:, k, 3] / robot.reach_m for k in range(3))
         ring = np.hypot(x, y) * _CELLS_PER_REACH
         level, azimuth = direction_parts(T[:, :3, 2], np.arctan2(y, x))

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
+import numpy as np
 from numba.core import types
 from numba.experimental import structref
 
@@ -16,13 +17,19 @@ _Tuple = TypeVar("_Tuple", bound=NamedTuple)
 
 def compiled(function: _Function) -> _Function:
     """The function as machine code. Without fast-math: equal arguments give equal bits on one platform."""
-    return numba.njit(cache=True, error_model="numpy")(function)
+    return cast("_Function", numba.njit(cache=True, error_model="numpy")(function))
+
+
+def constant(value: int) -> int:
+    """An integer for arguments of compiled functions, which are made again for each plain one."""
+    return cast("int", np.int64(value))
 
 
 def struct(fields: type[_Tuple]) -> type[_Tuple]:
     """A structure in memory with the fields of a NamedTuple, as machine code takes it: one pointer.
 
-    A tuple of arrays would be passed as all their sizes and strides, which compiles and runs many times slower.
+    A tuple of arrays would be passed as all their sizes and strides: that compiles and runs many
+    times slower.
     """
     name = f"{fields.__name__}Struct"
     own = {"__module__": fields.__module__, "__doc__": fields.__doc__}
@@ -39,6 +46,6 @@ _structs: dict[type, Any] = {}
 
 
 def in_memory(value: _Tuple) -> _Tuple:
-    """The structure of a tuple's fields, which shares its arrays; fields that are such tuples become structures."""
+    """The structure of a tuple's fields, which shares its arrays; such tuples in it become structures."""
     made = [in_memory(field) if type(field) in _structs else field for field in value]  # pyright: ignore
     return _structs[type(value)](*made)

@@ -7,18 +7,18 @@ bound of the distance decides.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from datagen.workers.geometry.mesh import F64
-from datagen.workers.kinematics.compiler import compiled, struct
-from datagen.workers.kinematics.tree import Ints
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.kinematics.compiler import compiled, constant, struct
+from datagen.workers.kinematics.tree import Bools, Ints
 
 _MAX_STEPS = 100
 _CONVERGED = 1e-12  # relative, of the squared distance
-# NumPy's integers: machine code would be made again for each plain constant.
-_ONE_SHAPE, _NOTHING, _NONE = np.int64(0), np.int64(0), np.int64(-1)
+_ONE_SHAPE, _NOTHING, _NONE = constant(0), constant(0), constant(-1)
 _TOUCHING = 1e-20  # squared distance (m^2) that counts as none
 
 
@@ -34,6 +34,18 @@ class Parts(NamedTuple):
 
 
 struct(Parts)
+
+
+def parts_of(parts_by_owner: Sequence[Sequence[F32 | F64]], touches: Sequence[int] | None = None) -> Parts:
+    """Parts of owners 0, 1, ..., each (V, 3) in its owner's frame."""
+    parts = [np.asarray(p, np.float64) for parts in parts_by_owner for p in parts]
+    owner = [k for k, parts in enumerate(parts_by_owner) for _ in parts]
+    low = np.array([p.min(axis=0) for p in parts]).reshape(-1, 3)
+    high = np.array([p.max(axis=0) for p in parts]).reshape(-1, 3)
+    may_touch = np.zeros(len(parts), np.int64) if touches is None else np.array(touches, np.int64)[owner]
+    points = np.concatenate([np.zeros((0, 3)), *parts])
+    first = np.cumsum([0, *map(len, parts)])
+    return Parts(points, first, np.array(owner, np.int64), (low + high) / 2, (high - low) / 2, may_touch)
 
 
 @compiled
@@ -155,9 +167,9 @@ def _closest_triangle(W: F64, v: F64) -> int:
 def gap_m(A: F64, T: F64, B: F64, near_m: float, far_m: float, axis: F64, W: F64, v: F64) -> float:
     """Distance of the hulls of A (Va, 3), moved by the pose T (3, 4), and of B (Vb, 3).
 
-    It stops early: a result of at most `near_m` is an upper bound, one above `far_m` a lower bound. `axis` (3,)
-    is a direction from B to A to begin with, and is set to the last one; zeros are allowed. `W` (4, 3) and `v` (3,)
-    are scratch.
+    It stops early: a result of at most `near_m` is an upper bound, one above `far_m` a lower bound. `axis`
+    (3,) is a direction from B to A to begin with, and is set to the last one; zeros are allowed. `W` (4, 3)
+    and `v` (3,) are scratch.
     """
     v[0], v[1], v[2] = axis[0], axis[1], axis[2]
     squared = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
@@ -346,54 +358,66 @@ def _relative(A: F64, B: F64, out: F64) -> None:
 
 
 @compiled
+def _place(parts: Parts, T: F64, s: Scratch) -> None:
+    """The centres of the parts' boxes, their owners posed by T (O, 3, 4)."""
+    owner, centers, placed = parts.owner, parts.center_m, s.center_m
+    for p in range(len(owner)):
+        M, c = T[owner[p]], centers[p]
+        for i in range(3):
+            placed[p, i] = M[i, 0] * c[0] + M[i, 1] * c[1] + M[i, 2] * c[2] + M[i, 3]
+
+
+@compiled
+def _pair_touches(parts: Parts, a: int, b: int, T: F64, axis: F64, s: Scratch) -> bool:
+    """Whether two parts touch, after `_place`: by boxes, each along the axes of the other, then exactly."""
+    owner, centers, halves, first = parts.owner, parts.center_m, parts.half_m, parts.first
+    placed, radii, M = s.center_m, s.half_m, s.relative
+    x, y, z = (
+        placed[a, 0] - placed[b, 0],
+        placed[a, 1] - placed[b, 1],
+        placed[a, 2] - placed[b, 2],
+    )
+    reach = radii[a, 0] + radii[b, 0]
+    if x * x + y * y + z * z > reach * reach:
+        return False
+    _relative(T[owner[a]], T[owner[b]], M)
+    c, h, low, half, m = centers[a], halves[a], centers[b], halves[b], s.v
+    for i in range(3):
+        m[i] = M[i, 0] * c[0] + M[i, 1] * c[1] + M[i, 2] * c[2] + M[i, 3] - low[i]
+        size = abs(M[i, 0]) * h[0] + abs(M[i, 1]) * h[1] + abs(M[i, 2]) * h[2]
+        if abs(m[i]) > size + half[i]:
+            return False
+    for i in range(3):
+        away = abs(M[0, i] * m[0] + M[1, i] * m[1] + M[2, i] * m[2])
+        size = abs(M[0, i]) * half[0] + abs(M[1, i]) * half[1] + abs(M[2, i]) * half[2]
+        if away > size + h[i]:
+            return False
+    A = parts.points_m[first[a] : first[a + 1]]
+    B = parts.points_m[first[b] : first[b + 1]]
+    return gap_m(A, M, B, 0.0, 0.0, axis, s.W, s.v) <= 0.0
+
+
+@compiled
 def hits_itself(parts: Parts, pairs: Ints, T: F64, axes: F64, s: Scratch) -> bool:
     """Whether any pair (K, 2) of the parts touches, their owners posed by T (O, 3, 4).
 
-    `axes` is (K, 3). The first column of `s.half_m` has the parts' radii around their boxes' centres.
+    `axes` (K, 3) keeps a direction between each two parts; `s` is that of `own_scratch`.
     """
-    M, owner, centers, halves = s.relative, parts.owner, parts.center_m, parts.half_m
-    points, first, placed, radii = parts.points_m, parts.first, s.center_m, s.half_m
-    for p in range(len(owner)):
-        N, c = T[owner[p]], centers[p]
-        for i in range(3):
-            placed[p, i] = N[i, 0] * c[0] + N[i, 1] * c[1] + N[i, 2] * c[2] + N[i, 3]
+    _place(parts, T, s)
     for k in range(len(pairs)):
-        a, b = pairs[k, 0], pairs[k, 1]
-        x, y, z = (
-            placed[a, 0] - placed[b, 0],
-            placed[a, 1] - placed[b, 1],
-            placed[a, 2] - placed[b, 2],
-        )
-        reach = radii[a, 0] + radii[b, 0]
-        if x * x + y * y + z * z > reach * reach:
-            continue
-        _relative(T[owner[a]], T[owner[b]], M)
-        c, h, low, half = centers[a], halves[a], centers[b], halves[b]
-        is_apart = False
-        mx, my, mz = 0.0, 0.0, 0.0
-        for i in range(3):
-            m = M[i, 0] * c[0] + M[i, 1] * c[1] + M[i, 2] * c[2] + M[i, 3] - low[i]
-            size = abs(M[i, 0]) * h[0] + abs(M[i, 1]) * h[1] + abs(M[i, 2]) * h[2]
-            is_apart |= abs(m) > size + half[i]
-            if i == 0:
-                mx = m
-            elif i == 1:
-                my = m
-            else:
-                mz = m
-        if is_apart:
-            continue
-        for i in range(3):
-            away = abs(M[0, i] * mx + M[1, i] * my + M[2, i] * mz)
-            size = abs(M[0, i]) * half[0] + abs(M[1, i]) * half[1] + abs(M[2, i]) * half[2]
-            is_apart |= away > size + h[i]
-        if is_apart:
-            continue
-        A = points[first[a] : first[a + 1]]
-        B = points[first[b] : first[b + 1]]
-        if gap_m(A, M, B, 0.0, 0.0, axes[k], s.W, s.v) <= 0.0:
+        if _pair_touches(parts, pairs[k, 0], pairs[k, 1], T, axes[k], s):
             return True
     return False
+
+
+@compiled
+def touching_pairs(parts: Parts, pairs: Ints, T: F64, s: Scratch, out: Bools) -> None:
+    """Which pairs (K, 2) of the parts touch, into out (K,), their owners posed by T (O, 3, 4)."""
+    _place(parts, T, s)
+    axis = np.empty(3)
+    for k in range(len(pairs)):
+        axis[0] = axis[1] = axis[2] = 0.0
+        out[k] = _pair_touches(parts, pairs[k, 0], pairs[k, 1], T, axis, s)
 
 
 @compiled
@@ -440,8 +464,9 @@ def hit_any(parts: Parts, T: F64, still: Still, rows: Ints) -> bool:
 
 
 @compiled
-def radii_m(parts: Parts, out: F64) -> None:
-    """Radii of the parts around their boxes' centres, into the first column of out (P, 3)."""
+def own_scratch(parts: Parts) -> Scratch:
+    """Arrays for contacts of the parts with each other; half sizes are radii around the boxes' centres."""
+    s = scratch_of(len(parts.owner), _NOTHING)
     for p in range(len(parts.owner)):
         most = 0.0
         for v in range(parts.first[p], parts.first[p + 1]):
@@ -449,4 +474,5 @@ def radii_m(parts: Parts, out: F64) -> None:
             for i in range(3):
                 squared += (parts.points_m[v, i] - parts.center_m[p, i]) ** 2
             most = max(most, squared)
-        out[p, 0] = math.sqrt(most)
+        s.half_m[p, 0] = math.sqrt(most)
+    return s

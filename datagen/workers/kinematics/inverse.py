@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.kinematics.compiler import compiled, struct
+from datagen.workers.kinematics.compiler import compiled, in_memory, struct
 from datagen.workers.kinematics.tree import KinematicTree
 
 POSITION_TOLERANCE_M = 0.0005
@@ -33,6 +33,8 @@ class IkWork(NamedTuple):
     jacobian: F64  # (A, 6)
     error: F64  # (6,)
     normal: F64  # (6, 6)
+    twist: F64  # (6,)
+    step: F64  # (A,)
 
 
 new_ik_work = struct(IkWork)
@@ -178,15 +180,35 @@ def _solve6(H: F64, e: F64) -> None:
 
 
 @compiled
+def _damped_step(J: F64, e: F64, damping: float, work: IkWork) -> None:
+    """The change (A,) of the coordinates that leads along the twist e (6,), into the work."""
+    H, y = work.normal, work.twist
+    for i in range(6):
+        y[i] = e[i]
+        for k in range(i + 1):
+            s = 0.0
+            for m in range(len(J)):
+                s += J[m, i] * J[m, k]
+            H[i, k] = s
+        H[i, i] += damping
+    _solve6(H, y)
+    for m in range(len(J)):
+        s = 0.0
+        for i in range(6):
+            s += J[m, i] * y[i]
+        work.step[m] = s
+
+
+@compiled
 def solve(tree: KinematicTree, T_root: F64, goal: F64, q: F64, work: IkWork) -> bool:
     """Move the coordinates (A,), in place, until the TCP is at the goal (3, 4); whether it is.
 
     Levenberg-Marquardt with damping that grows with the squared error (Sugihara 2011), on the pose error as
-    a twist in the TCP's frame; a coordinate at its limit stays there while the step pushes it out. The goal
-    is reached within 0.5 mm and 0.5 degrees.
+    a twist in the TCP's frame. Where it pushes coordinates at their limits out, the step is computed again
+    without them: the others take over. The goal is reached within 0.5 mm and 0.5 degrees.
     """
     joints, T, J = work.joints, work.tcp, work.jacobian
-    count, e, H = len(q), work.error, work.normal
+    count, e, dq = len(q), work.error, work.step
     for k in range(count):
         q[k] = min(max(q[k], tree.lower[k]), tree.upper[k])
     best, best_at = np.inf, 0
@@ -204,25 +226,21 @@ def solve(tree: KinematicTree, T_root: F64, goal: F64, q: F64, work: IkWork) -> 
         elif step - best_at >= _PATIENCE:
             return False
         tcp_jacobian(tree, joints, T, J)
-        for i in range(6):
-            for k in range(i + 1):
-                s = 0.0
-                for m in range(count):
-                    s += J[m, i] * J[m, k]
-                H[i, k] = s
-            H[i, i] += _DAMPING + _DAMPING_PER_ERROR * squared
-        _solve6(H, e)
-        longest, scale = 0.0, 1.0
+        damping, is_stuck = _DAMPING + _DAMPING_PER_ERROR * squared, True
+        while is_stuck:
+            _damped_step(J, e, damping, work)
+            is_stuck = False
+            for m in range(count):
+                if (q[m] <= tree.lower[m] and dq[m] < 0) or (q[m] >= tree.upper[m] and dq[m] > 0):
+                    is_stuck = True
+                    for i in range(6):
+                        J[m, i] = 0.0
+        longest = 0.0
         for m in range(count):
-            s = 0.0
-            for i in range(6):
-                s += J[m, i] * e[i]
-            J[m, 0] = s
-            longest = max(longest, abs(s))
-        if longest > _LONGEST_STEP:
-            scale = _LONGEST_STEP / longest
+            longest = max(longest, abs(dq[m]))
+        scale = min(1.0, _LONGEST_STEP / longest) if longest > 0 else 1.0
         for m in range(count):
-            q[m] = min(max(q[m] + scale * J[m, 0], tree.lower[m]), tree.upper[m])
+            q[m] = min(max(q[m] + scale * dq[m], tree.lower[m]), tree.upper[m])
     return False
 
 
@@ -235,4 +253,33 @@ def ik_workspace(tree: KinematicTree) -> IkWork:
         np.empty((len(tree.lower), 6)),
         np.empty(6),
         np.empty((6, 6)),
+        np.empty(6),
+        np.empty(len(tree.lower)),
     )
+
+
+@compiled
+def _poses_at(tree: KinematicTree, q: F64, joints: F64, root: F64, out: F64) -> None:
+    joint_poses(tree, root, q, joints)
+    frame_poses(tree, root, joints, out)
+
+
+class TreePoses:
+    """Forward and inverse kinematics of one tree, called from Python; base frame. Not safe for threads."""
+
+    def __init__(self, tree: KinematicTree) -> None:
+        self._tree = in_memory(tree.along_z())
+        self._joints, self._root = np.empty((len(tree.parent), 3, 4)), np.eye(4)[:3].copy()
+        self._frames, self._work = len(tree.frame_joint), ik_workspace(self._tree)
+
+    def __call__(self, q: F64) -> F64:
+        """Poses (F, 3, 4) of the frames at coordinates (A,)."""
+        out = np.empty((self._frames, 3, 4))
+        _poses_at(self._tree, q, self._joints, self._root, out)
+        return out
+
+    def solve(self, T_tcp: F64, q_seed: F64) -> F64 | None:
+        """Coordinates (A,) within their limits that put the TCP at the pose (4, 4), or None: see `solve`."""
+        q = np.array(q_seed, np.float64)
+        goal = np.ascontiguousarray(T_tcp[:3])
+        return q if solve(self._tree, self._root, goal, q, self._work) else None

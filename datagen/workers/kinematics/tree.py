@@ -65,9 +65,6 @@ class Coordinates:
 
     matrix: F64  # (J, A)
     offset: F64  # (J,)
-    lower: F64  # (A,)
-    upper: F64  # (A,)
-    slides: Bools  # (A,)
     are_joints: bool  # each joint has a coordinate of its own, in order
 
     @staticmethod
@@ -76,10 +73,7 @@ class Coordinates:
         matrix = np.zeros((len(tree.ratio), len(tree.lower)))
         matrix[np.arange(len(tree.ratio)), tree.coordinate] = tree.ratio
         plain = matrix.shape[0] == matrix.shape[1] and bool((matrix == np.eye(len(matrix))).all())
-        slides = np.array(matrix[tree.slides].any(axis=0))
-        return Coordinates(
-            matrix, tree.offset, tree.lower, tree.upper, slides, plain and not tree.offset.any()
-        )
+        return Coordinates(matrix, tree.offset, plain and not tree.offset.any())
 
     def __call__(self, q: F64) -> F64:
         return q if self.are_joints else self.matrix @ q + self.offset

@@ -24,8 +24,8 @@ from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, translation, yaw_pose
 from datagen.workers.grasps.grasp_cache import GraspSet, grasps_of
+from datagen.workers.kinematics.tree import Bools
 from datagen.workers.motion import MotionPlan, PlanReport
-from datagen.workers.motion.collision import Bools
 from datagen.workers.motion.plan_candidate import plan_candidate
 from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
 from datagen.workers.robots import open_robot

@@ -23,7 +23,7 @@ from datagen.workers.scenes import SettledScene
 from datagen.workers.watched_clock import count_label
 
 # 3: four different seeds of inverse kinematics for each grasp.
-VERSION = 3
+VERSION = 4
 _CODES = {name: code for code, name in enumerate(OUTCOMES)}
 
 

@@ -1,4 +1,4 @@
-"""Robots and hands as the compiled planner sees them: convex parts, tucked poses and where the hand can be."""
+"""Robots and hands as the compiled planner sees them: convex parts, tucked poses, where the hand can be."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from datagen.workers.geometry.mesh import F32, F64, I32
 from datagen.workers.kinematics.compiler import in_memory
-from datagen.workers.kinematics.contacts import Parts
+from datagen.workers.kinematics.contacts import Parts, parts_of
 from datagen.workers.kinematics.tree import Bools, Ints, KinematicTree
 from datagen.workers.motion.arm_motion import Arm
 from datagen.workers.motion.hand_motion import FLOOR, Hand
@@ -30,23 +30,11 @@ _PEDESTAL_SIDES = 16
 _PEDESTAL_GAP_M = 0.02  # between the pedestal's top and the mount
 
 
-def parts_of(parts_by_owner: Sequence[Sequence[F32 | F64]], touches: Sequence[int] | None = None) -> Parts:
-    """Parts of owners 0, 1, ..., each (V, 3) in its owner's frame."""
-    parts = [np.asarray(p, np.float64) for parts in parts_by_owner for p in parts]
-    owner = [k for k, parts in enumerate(parts_by_owner) for _ in parts]
-    low = np.array([p.min(axis=0) for p in parts]).reshape(-1, 3)
-    high = np.array([p.max(axis=0) for p in parts]).reshape(-1, 3)
-    may_touch = np.zeros(len(parts), np.int64) if touches is None else np.array(touches, np.int64)[owner]
-    points = np.concatenate([np.zeros((0, 3)), *parts])
-    first = np.cumsum([0, *map(len, parts)])
-    return Parts(points, first, np.array(owner, np.int64), (low + high) / 2, (high - low) / 2, may_touch)
-
-
 _arms: OrderedDict[tuple[int, int], tuple[Robot, Arm]] = OrderedDict()
 
 
 def arm_of(robot: Robot, draw: int = 0) -> Arm:
-    """The robot without a pedestal; built once for all mount heights of an arm. `draw` seeds its reach map."""
+    """The robot without a pedestal, built once for all mount heights. `draw` seeds its reach map."""
     # Copies of an arm at other heights share their parts. The stored robot keeps the id of its parts in use.
     key = (id(robot.link_parts_m), draw)
     if key in _arms:
@@ -55,13 +43,12 @@ def arm_of(robot: Robot, draw: int = 0) -> Arm:
     tree = robot.tree.along_z()
     links = robot.link_parts_m[: robot.first_hand_link]
     moves = tree.frame_joint[: len(links)] >= 0
-    own = _own_parts(robot)
     arm = Arm(
         tree,
         parts_of(_only(links, moves), [int(FLOOR) * int(stands) for stands in robot.is_base[: len(links)]]),
         parts_of(_only(links, ~moves)),
-        own,
-        _pairs(own.owner, robot.self_pairs),
+        robot.self_collision.parts,
+        robot.self_collision.part_pairs,
         np.ascontiguousarray(robot.homes_rad),
         np.where(robot.slides, _RAD_PER_M, 1.0),
         reach_map(tree, draw),
@@ -76,32 +63,8 @@ def _only(parts: Sequence[Sequence[F32]], rows: Bools) -> list[Sequence[F32]]:
     return [some if chosen else () for some, chosen in zip(parts, rows.tolist(), strict=True)]
 
 
-def _own_parts(robot: Robot) -> Parts:
-    """The links' parts, one hull a finger: close enough, and faster than its boxes."""
-    palm = robot.first_hand_link + 1
-    return parts_of(
-        [*robot.link_parts_m[:palm], *((_one_hull(p),) if p else () for p in robot.link_parts_m[palm:])]
-    )
-
-
-def _one_hull(parts_m: Sequence[F32]) -> F32:
-    points = np.concatenate(parts_m)
-    return points[np.sort(ConvexHull(points).vertices)]
-
-
-def _pairs(owner: Ints, links: Sequence[tuple[int, int]]) -> Ints:
-    """Pairs (K, 2) of parts of the pairs of links."""
-    rows = [
-        (a, b)
-        for one, two in links
-        for a in np.flatnonzero(owner == one)
-        for b in np.flatnonzero(owner == two)
-    ]
-    return np.array(rows, np.int64).reshape(-1, 2)
-
-
 def on_pedestal(arm: Arm, base_height_m: float, radius_m: float) -> Arm:
-    """The arm on a prism from the floor to just below the mount, which only its first moving link may touch."""
+    """The arm on a prism from the floor to just below the mount, which only its first link may touch."""
     top_m, bottom_m = -_PEDESTAL_GAP_M, -base_height_m
     if top_m <= bottom_m or radius_m <= 0:
         return arm
@@ -147,7 +110,7 @@ def _f64(part: F32) -> F64:
 
 
 def core_of(part: F32, depth_m: float = TOUCH_M) -> F64:
-    """Corners of the points that lie at least `depth_m` inside a convex part (V, 3); a thinner one has its middle."""
+    """Corners of the points at least `depth_m` inside a convex part (V, 3); a thinner one has its middle."""
     hull = ConvexHull(part.astype(np.float64))
     middle = hull.points[hull.vertices].mean(axis=0)
     planes = hull.equations.copy()
@@ -235,7 +198,8 @@ def _samples(
     T_wrist[:3, :3] = np.frombuffer(R_tcp).reshape(3, 3)
     low, high = np.frombuffer(lower), np.frombuffer(upper)
     tree = KinematicTree(
-        np.frombuffer(parent, np.int64), np.frombuffer(T).reshape(-1, 4, 4), np.frombuffer(axis).reshape(-1, 3),
+        np.frombuffer(parent, np.int64), np.frombuffer(T).reshape(-1, 4, 4),
+        np.frombuffer(axis).reshape(-1, 3),
         np.frombuffer(slides, np.bool_), np.frombuffer(coordinate, np.int64), np.frombuffer(ratio),
         np.frombuffer(offset), low, high, np.array([tcp_joint]), T_wrist[None],
     )  # fmt: skip

@@ -9,8 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.kinematics.compiler import compiled, struct
-from datagen.workers.kinematics.contacts import Parts, Scratch, hits_itself, hits_still, radii_m, scratch_of
+from datagen.workers.kinematics.compiler import compiled, constant, struct
+from datagen.workers.kinematics.contacts import (
+    Parts,
+    Scratch,
+    hits_itself,
+    hits_still,
+    own_scratch,
+    scratch_of,
+)
 from datagen.workers.kinematics.inverse import (
     IkWork,
     frame_poses,
@@ -33,8 +40,8 @@ from datagen.workers.motion.hand_motion import (
 )
 from datagen.workers.motion.reach_map import ReachMap, ReachWork, reach_workspace
 
-NO_HAND = np.int64(-1)  # an opening: the arm alone
-ONE_SHAPE, NO_HOME = np.int64(0), np.int64(-1)
+NO_HAND = constant(-1)  # an opening: the arm alone
+ONE_SHAPE, NO_HOME = constant(0), constant(-1)
 _FIRST_LOOK = 8  # stride of the first, coarse check of a long line
 _OFF_LINE_M = 0.002  # between neighbouring points, where coordinates are interpolated
 
@@ -96,8 +103,6 @@ struct(Search)
 def workspace(arm: Arm, hand: Hand, room: Room, back: F64, lift: F64, without_path: Ints) -> Work:
     """Arrays for one base pose: no result depends on earlier ones."""
     still, count = len(room.still.kind), len(arm.weight)
-    own = scratch_of(len(arm.own.owner), NOTHING)
-    radii_m(arm.own, own.half_m)
     return new_work(
         np.empty((len(arm.tree.parent), 3, 4)),
         np.empty((len(arm.tree.frame_joint) + 1, 3, 4)),
@@ -105,7 +110,7 @@ def workspace(arm: Arm, hand: Hand, room: Room, back: F64, lift: F64, without_pa
         reach_workspace(count),
         scratch_of(len(arm.body.owner), still),
         hand_workspace(len(hand.whole.owner), still),
-        own,
+        own_scratch(arm.own),
         np.zeros((len(arm.own_pairs), 3)),
         np.zeros(len(arm.homes), np.int8),
         back,
@@ -157,7 +162,7 @@ def length(weight: F64, a: F64, b: F64) -> float:
 @compiled
 def steps_on(weight: F64, a: F64, b: F64, step: float) -> int:
     """How many steps of at most `step` radians lie on a line."""
-    return max(1, int(math.ceil(length(weight, a, b) / step - 1e-9)))
+    return max(1, math.ceil(length(weight, a, b) / step - 1e-9))
 
 
 @compiled
@@ -186,9 +191,9 @@ def is_line_free(s: Search, a: F64, b: F64, opening: int, ignored: int) -> bool:
 def follow(s: Search, T: F64, back_m: float, rise_m: float, ignored: int, out: F64) -> bool:
     """Coordinates (n, A) along a straight line of the hand from the grasp (3, 4); whether all is free.
 
-    Rows `out[0]` and, on the way back, `out[-1]` are given. It fails where a pose has no solution, a coordinate
-    jumps, the hand leaves the line by more than 2 mm in between, or the arm collides. The hand's own line is
-    known to be free.
+    Rows `out[0]` and, on the way back, `out[-1]` are given. It fails where a pose has no solution, a
+    coordinate jumps, the hand leaves the line by more than 2 mm in between, or the arm collides. The hand's
+    own line is known to be free.
     """
     n, count = len(out), out.shape[1]
     tree, weight, w, jump, is_end_known = s.arm.tree, s.arm.weight, s.work, s.limits.jump, back_m > 0
@@ -240,7 +245,7 @@ def has_free_home(s: Search) -> bool:
 
 @compiled
 def next_home(s: Search, q: F64, after: int) -> int:
-    """The free tucked pose that is nearest to the coordinates (A,), or the next one `after` another; -1: none."""
+    """The free tucked pose nearest to the coordinates (A,), or the next one `after` another; -1: none."""
     found, homes, weight = NO_HOME, s.arm.homes, s.arm.weight
     passed = 0.0 if after < 0 else length(weight, homes[after], q)
     least = np.inf

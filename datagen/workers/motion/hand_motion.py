@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.kinematics.compiler import compiled, struct
+from datagen.workers.kinematics.compiler import compiled, constant, struct
 from datagen.workers.kinematics.contacts import Parts, Scratch, Still, hits_still, scratch_of
 from datagen.workers.kinematics.tree import Bools, Ints
 
-# Kinds of still parts, as bits. NumPy's integers: machine code would be made again for each plain constant.
-NOTHING, TARGET, FLOOR = np.int64(0), np.int64(1), np.int64(2)
+# Kinds of still parts, as bits.
+NOTHING, TARGET, FLOOR = constant(0), constant(1), constant(2)
 _ALL_BUT_TARGET = ~TARGET
 
 
@@ -94,7 +94,7 @@ def hand_workspace(parts: int, still: int) -> HandWork:
 @compiled
 def points_on(length_m: float, step_m: float) -> int:
     """How many points lie on a line, both ends included, at most `step_m` apart."""
-    return 1 + int(math.ceil(length_m / step_m - 1e-9))
+    return 1 + math.ceil(length_m / step_m - 1e-9)
 
 
 @compiled

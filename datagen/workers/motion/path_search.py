@@ -1,4 +1,4 @@
-"""Paths from a tucked pose to a pregrasp where the straight one is not free, compiled: RRT-Connect and shortcuts."""
+"""Paths to a pregrasp where the straight one is not free, compiled: RRT-Connect and shortcuts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LONGEST_EDGE = 1.0
 def _grow(
     s: Search, opening: int, tree: F64, parent: Ints, n: int, q_to: F64, longest: float
 ) -> tuple[int, bool]:
-    """Grow from the nearest node towards `q_to` as far as the line is free; the new number, and if it got there."""
+    """Grow from the nearest node towards `q_to` while the line is free; the new size, and if it got there."""
     weight, at, least = s.arm.weight, 0, np.inf
     for k in range(n):
         far = length(weight, tree[k], q_to)
@@ -50,10 +50,10 @@ def _grow(
 def connect(
     s: Search, opening: int, q_start: F64, q_goal: F64, iterations: int, rng: np.random.Generator
 ) -> tuple[F64, int]:
-    """Corners (K, A) of a free path by RRT-Connect (Kuffner and LaValle 2000), and the samples used; K may be 0.
+    """Corners (K, A) of a free path by RRT-Connect (Kuffner and LaValle 2000), and the samples used.
 
-    Each sample extends one tree by an edge of at most 1 rad towards it; the other tree then grows straight
-    towards the new end as far as the line is free. The trees take turns.
+    K is 0 where none was found. Each sample extends one tree by an edge of at most 1 rad towards it; the
+    other tree then grows straight towards the new end as far as the line is free. The trees take turns.
     """
     count = len(q_start)
     trees, parents = np.empty((2, 2 * iterations + 2, count)), np.empty((2, 2 * iterations + 2), np.int64)

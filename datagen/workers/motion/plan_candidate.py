@@ -32,8 +32,8 @@ _PORTION = 96  # poses ordered together at first; each further portion is as lar
 _SHORT = 8  # poses tried to tell a lift that is too far from no solution
 # The search near poses: poses in a round, the most that they are near, and those for which IK is tried.
 _NEARBY, _ORIGINS, _NEARBY_TRIED = 480, 24, 48
-# In each round and in all: a turn about the closing axis; tilts about the pads' width and the approach, within the
-# contacts' friction cone; shifts along them, by less than half a pad.
+# In each round and in all: a turn about the closing axis; tilts about the pads' width and the approach,
+# within the contacts' friction cone; shifts along them, by less than half a pad.
 _MOTION_STD = np.array([np.radians(20), np.radians(3), np.radians(3), 0.003, 0.003])
 _MOST_MOTION = np.array([np.inf, np.radians(8), np.radians(8), 0.006, 0.006])
 
@@ -44,8 +44,8 @@ def plan_candidate(
     """Search for a whole plan from the base pose (4, 4) to any grasp except those in `skip`.
 
     `skip` are rows of the GraspSet. The result depends on the arguments alone: neither on earlier candidates
-    nor on time. `rng` is used only where no grasp has a straight path, and for poses near the grasps that came
-    furthest; `grasp` of such a plan is -1.
+    nor on time. `rng` is used only where no grasp has a straight path, and for poses near the grasps that
+    came furthest; `grasp` of such a plan is -1.
     """
     around = prepared.around
     allowed = ~np.isin(around.grasp, sorted(skip)) if skip else np.ones(len(around.grasp), np.bool_)
@@ -88,12 +88,14 @@ class _Search:
         self.compiled = in_memory(Search(*at, scene.compiled_limits, self.T_root, rows, stuck, work))
 
     def best_first(self, poses: Poses, start: int, end: int, short: Ints) -> Ints:
-        """The free poses from `start` to `end` that can be reached, those with most samples near them first."""
+        """The free poses from `start` to `end` that can be reached, those with most samples near first."""
         near = np.zeros(end - start, np.int64)
         samples_near(self.compiled, poses, start, end, near, short)
         return start + np.argsort(-near, kind="stable")[: np.count_nonzero(near)]
 
-    def try_poses(self, poses: Poses, rows: Ints, of_grasps: bool, stages: dict[int, int]) -> MotionPlan | None:
+    def try_poses(
+        self, poses: Poses, rows: Ints, of_grasps: bool, stages: dict[int, int]
+    ) -> MotionPlan | None:
         """The plan of the first of these rows of the poses that has one; `stages` gets how far each came."""
         for k in rows.tolist():
             row, T, opening = k if of_grasps else -1, poses.T_world_tcp[k], int(poses.opening[k])
@@ -202,10 +204,10 @@ def _near_grasps(search: _Search, rows: list[int]) -> MotionPlan | None:
 
 
 def _varied(T: F64, motion: F64, rng: np.random.Generator) -> tuple[F64, F64]:
-    """Poses (N, 3, 4) and motions (N, 5): random ones near the given motions of grasps, each in its own frame.
+    """Poses (N, 3, 4) and motions (N, 5): random ones near the given motions of grasps, in their own frames.
 
-    A motion is a turn about y, tilts about x and z, shifts along x and z. Both fingers keep their contacts, so
-    that most of these poses hold the object as the grasp does.
+    A motion is a turn about y, tilts about x and z, shifts along x and z. Both fingers keep their contacts,
+    so that most of these poses hold the object as the grasp does.
     """
     motion = motion + rng.standard_normal(motion.shape) * _MOTION_STD
     motion = np.clip(motion, -_MOST_MOTION, _MOST_MOTION)

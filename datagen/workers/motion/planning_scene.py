@@ -14,9 +14,9 @@ from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.grasps.grasp_cache import GraspSet
 from datagen.workers.houses.house import House
 from datagen.workers.kinematics.compiler import in_memory
-from datagen.workers.kinematics.contacts import Parts, Still, hit_any
+from datagen.workers.kinematics.contacts import Parts, Still, hit_any, parts_of
 from datagen.workers.kinematics.tree import Ints
-from datagen.workers.motion.arm_model import TOUCH_M, arm_of, core_of, hand_of, on_pedestal, parts_of
+from datagen.workers.motion.arm_model import TOUCH_M, arm_of, core_of, hand_of, on_pedestal
 from datagen.workers.motion.arm_motion import Arm
 from datagen.workers.motion.hand_motion import (
     FLOOR,
@@ -111,9 +111,7 @@ def prepare(
     key = (robot.gripper.digest, grasps, params, per_scene, around_m)
     if key not in known:
         known[key] = hand_scene(scene, robot.gripper, grasps, limits, per_scene, around_m)
-    return PlanningScene(
-        robot, params, limits, arm.weight, in_memory(arm), in_memory(limits), known[key]
-    )
+    return PlanningScene(robot, params, limits, arm.weight, in_memory(arm), in_memory(limits), known[key])
 
 
 # By scene, for as long as it lives. The key holds the GraspSet, so that its id is not used again.

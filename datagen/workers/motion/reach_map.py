@@ -1,8 +1,8 @@
 """Where a hand can be, seen from its base, with joint vectors that bring it near: a capability map.
 
-Random joint vectors are sorted into cells of the wrist's height and distance and the hand's direction and roll
-(Zacharias, Borst, Hirzinger 2007). An arm whose first turning joint stands upright is turned to the front first,
-so that this joint need not be sampled; for others the azimuth is one more axis.
+Random joint vectors are sorted into cells of the wrist's height and distance and the hand's direction and
+roll (Zacharias, Borst, Hirzinger 2007). An arm whose first turning joint stands upright is turned to the
+front first, so that this joint need not be sampled; for others the azimuth is one more axis.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def reach_workspace(coordinates: int) -> ReachWork:
 
 @compiled
 def _cell(distance: float, height: float, azimuth: float, a: F64, c: F64, turns: bool) -> int:
-    """The cell of a hand at a distance and height (-1 to 1), approaching along a and closing along c, (3,)."""
+    """The cell of a hand at a distance and height (-1 to 1), with approach a and closing axis c, (3,)."""
     i = min(int(distance * _DISTANCES), _DISTANCES - 1)
     k = min(max(int((height + 1) / 2 * _HEIGHTS), 0), _HEIGHTS - 1)
     face, largest = 0, abs(a[0])
@@ -93,7 +93,7 @@ def _cell(distance: float, height: float, azimuth: float, a: F64, c: F64, turns:
 
 @compiled
 def _feature(reach: ReachMap, T: F64, out: F64) -> float:
-    """Distance, height, approach and closing axis (8,) of a TCP pose (3, 4) in the base frame, turned to the front.
+    """Distance, height, approach and closing axis (8,) of a TCP pose (3, 4), base frame, turned to the front.
 
     Returns the azimuth by which it was turned; the first number is above 1 where the wrist is out of the map.
     """
@@ -143,7 +143,7 @@ def cells_near(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> float:
 
 @compiled
 def score(reach: ReachMap, T: F64, w: ReachWork) -> int:
-    """How many samples lie near a TCP pose (3, 4) in the base frame: those of its own cell count eight times."""
+    """How many samples lie near a TCP pose (3, 4), base frame: those of its own cell count eight times."""
     cells_near(reach, T, w.cells, w.feature)
     total, first, cells = 0, reach.first, w.cells
     for k in range(7):
@@ -154,10 +154,10 @@ def score(reach: ReachMap, T: F64, w: ReachWork) -> int:
 
 @compiled
 def seeds(reach: ReachMap, tree: KinematicTree, T: F64, out: F64, w: ReachWork) -> int:
-    """Joint vectors (S, A) of samples near a TCP pose (3, 4) that differ from each other; how many were found.
+    """Joint vectors (S, A) of samples near a TCP pose (3, 4) that differ from each other; how many there are.
 
-    Each further one is the first that differs from those before by 1 in some coordinate, or where there is none
-    the one that differs most.
+    Each further one is the first that differs from those before by 1 in some coordinate, or where there is
+    none the one that differs most.
     """
     cells, near, gap = w.cells, w.near, w.gap
     azimuth = cells_near(reach, T, cells, w.feature)

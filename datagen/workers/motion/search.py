@@ -50,10 +50,10 @@ def _inverse_times(A: F64, B: F64, out: F64) -> None:
 
 @compiled
 def samples_near(s: Search, poses: Poses, start: int, end: int, near: Ints, short: Ints) -> None:
-    """Samples of the reach map near poses `start` to `end` that are free, into near (end - start,); 0 elsewhere.
+    """Samples of the reach map near the free poses from `start` to `end`, into near (end - start,).
 
-    The least of those near the pose, near its pregrasp and near the end of its lift. Poses that can be reached
-    and not lifted go to `short`, behind those that are there, while there is room.
+    The least of those near the pose, near its pregrasp and near the end of its lift; 0 at other poses. Poses
+    that can be reached and not lifted go to `short`, behind those that are there, while there is room.
     """
     limits = s.limits
     pose, local, work = np.empty((3, 4)), s.work.reach.local, s.work.reach
@@ -85,9 +85,9 @@ def samples_near(s: Search, poses: Poses, start: int, end: int, near: Ints, shor
 
 @compiled
 def try_pose(s: Search, T: F64, opening: int) -> tuple[int, int]:
-    """The furthest stage that a free pose of the hand (3, 4) leads to, and the tucked pose it is reached from.
+    """The furthest stage that a free pose of the hand (3, 4) leads to, and the tucked pose that it begins at.
 
-    Cheap checks come first. The work gets the lines of a success, and those of a pose without a straight path.
+    Cheap checks come first. The work gets the lines of a success, and of a pose without a straight path.
     """
     arm, limits, w, T_root = s.arm, s.limits, s.work, s.T_root
     tree, count, stage, ways = arm.tree, len(arm.weight), NO_IK, 0
@@ -149,7 +149,9 @@ def try_pose(s: Search, T: F64, opening: int) -> tuple[int, int]:
 
 
 @compiled
-def path_to(s: Search, k: int, opening: int, iterations: int, rng: np.random.Generator) -> tuple[F64, int, int]:
+def path_to(
+    s: Search, k: int, opening: int, iterations: int, rng: np.random.Generator
+) -> tuple[F64, int, int]:
     """A free path (M, A) to grasp `k` of those without a straight one, its tucked pose, and the samples used.
 
     M is 0 where none was found.
@@ -176,7 +178,7 @@ def length_and_clearance(s: Search, k: int, opening: int, q_reach: F64) -> tuple
     clearance_m, some, still, hand = _FAR_M, min(_CLEARANCE_POSES, len(q_reach)), s.room.still, w.hand
     for look in range(2):  # first the parts whose boxes are nearest: then few others need a distance
         for row in range(some):
-            pose_arm(s, q_reach[int(round(row * (len(q_reach) - 1) / max(some - 1, 1)))])
+            pose_arm(s, q_reach[round(row * (len(q_reach) - 1) / max(some - 1, 1))])
             put(w.frames[-2], hand.frame[0])
             clearance_m = smallest_gap_m(
                 s.hand.whole, opening, hand.frame, still, s.rows, look == 0, clearance_m, hand.whole

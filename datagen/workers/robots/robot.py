@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pinocchio
-from scipy.linalg import lapack
 from scipy.spatial import ConvexHull
 
 from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import F32, F64, Mesh, concatenate
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.houses.glb import read_glb
+from datagen.workers.kinematics.inverse import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_M, TreePoses
 from datagen.workers.kinematics.tree import Coordinates, KinematicTree
 from datagen.workers.robots.arm_chain import TURN
 from datagen.workers.robots.assembly import assemble
@@ -27,24 +24,13 @@ from datagen.workers.robots.robot_file import RobotSource
 from datagen.workers.robots.self_collision import SelfCollision
 from datagen.workers.robots.tucked import tucked_poses
 
-# Their binary modules have no types.
-pin: Any = pinocchio
-_lapack: Any = lapack
 _GREY = 190
 _ROUNDING_M = 0.001  # far more than the rounding errors of lengths and tolerances
 _read_visual = lru_cache(maxsize=64)(read_glb)
-POSITION_TOLERANCE_M = 0.0005
-ANGLE_TOLERANCE_RAD = float(np.radians(0.5))
-_MAX_STEPS = 40
-_LONGEST_STEP_RAD = 1.0  # any joint
-_DAMPING = 1e-4
-_DAMPING_PER_ERROR = 0.003
-# Fails when the best error has not fallen to this share within this number of steps.
-_PATIENCE, _PROGRESS = 8, 0.7
 
 
 class Robot:
-    """A robot at one mount height, moved by pinocchio. A coordinates move the arm; L links carry its shape.
+    """A robot at one mount height. A coordinates move the arm; L links carry its shape.
 
     Base frame: the arm's mount, at (x, y, base_height_m) in the world, z up, x to the front. Coordinates are
     radians, and metres where joints slide. Equal arguments give equal numbers on every machine of one
@@ -84,25 +70,16 @@ class Robot:
         # Whether each link (L,) stands on the floor: what carries the arm.
         self.is_base = np.arange(len(assembly.bodies)) <= int(assembly.arm[0].name == TURN)
         self.tree: KinematicTree = assembly.tree()  # the only source of kinematics
-        self._model = _model_of(
-            self.tree, [*(joint.name for joint in assembly.arm)], [*self.link_names, "tcp"]
-        )
-        self._data = self._model.createData()
         self.coordinates = Coordinates.of(self.tree)
-        self._tcp = self._model.getFrameId("tcp")
-        first = self._tcp - len(self.link_names)
-        self._frames = range(first, self._tcp)
-        frames = self._model.frames
-        joints = [frames[f].parentJoint for f in self._frames]
-        placements = [frames[f].placement.homogeneous for f in self._frames]
-        # One hull a finger is close enough and four times as fast as its boxes.
+        self._poses = TreePoses(self.tree)
+        # One hull a finger is close enough, and faster than its boxes.
         fingers = self.link_parts_m[self.first_hand_link + 1 :]
         parts = [
             *self.link_parts_m[: self.first_hand_link + 1],
             *((_joint_hull(p),) if p else () for p in fingers),
         ]
-        self._self_collision = SelfCollision(self._model, self.coordinates, parts, joints, placements)
-        self.self_pairs = self._self_collision.pairs  # pairs of links that must not touch
+        self.self_collision = SelfCollision(self.tree, self._poses, parts)
+        self.self_pairs = self.self_collision.pairs  # pairs of links that must not touch
         self.homes_rad: F64 = self._tucked()  # (H, A), tucked, free of self-collision
 
     def _tucked(self) -> F64:
@@ -151,21 +128,17 @@ class Robot:
 
     def T_base_link(self, q_rad: F64) -> F64:
         """Poses (L, 4, 4) of the links at the joints (A,)."""
-        pin.framesForwardKinematics(self._model, self._data, self.coordinates(q_rad))
-        placements = self._data.oMf
-        T = np.empty((len(self._frames), 4, 4))
-        for k, frame in enumerate(self._frames):
-            T[k] = placements[frame].homogeneous
+        T = np.tile(np.eye(4), (len(self.link_names), 1, 1))
+        T[:, :3] = self._poses(q_rad)[:-1]
         return T
 
     def T_base_tcp(self, q_rad: F64) -> F64:
         """Pose (4, 4) of the gripper's TCP at the joints (A,)."""
-        pin.forwardKinematics(self._model, self._data, self.coordinates(q_rad))
-        return pin.updateFramePlacement(self._model, self._data, self._tcp).homogeneous
+        return np.concatenate([self._poses(q_rad)[-1], [[0.0, 0.0, 0.0, 1.0]]])
 
     def ik(self, T_base_tcp: F64, q_seed_rad: F64) -> F64 | None:
         """Joints (A,) within the limits that put the TCP at the pose (0.5 mm, 0.5 degrees), or None."""
-        return solve(self._model, self._data, self._tcp, self.coordinates, T_base_tcp, q_seed_rad)
+        return self._poses.solve(T_base_tcp, q_seed_rad)
 
     def is_wrist_within_reach(self, T_base_tcp: F64, beyond_m: float = 0.0) -> npt.NDArray[np.bool_]:
         """Whether the last joint is at most `beyond_m` beyond its reach at each TCP pose (N, 4, 4); (N,).
@@ -177,29 +150,11 @@ class Robot:
 
     def collides_itself(self, q_rad: F64) -> bool:
         """Whether any of `self_pairs` touch at the joints (A,)."""
-        return self._self_collision.touches(q_rad)
+        return self.self_collision.touches(q_rad)
 
     def link_meshes(self) -> tuple[Mesh, ...]:
         """Visual meshes (L,), link frames."""
         return tuple(_mesh_of(body) for body in self.assembly.bodies)
-
-
-def _model_of(tree: KinematicTree, joints: Sequence[str], frames: Sequence[str]) -> Any:
-    """pinocchio's model of a tree."""
-    model = pin.Model()
-    ids = [0]
-    for j, name in enumerate(joints):
-        axis = tree.axis[j]
-        if tree.slides[j]:
-            kind = pin.JointModelPrismaticUnaligned(axis)
-        elif np.array_equal(axis, (0, 0, 1)):
-            kind = pin.JointModelRZ()
-        else:
-            kind = pin.JointModelRevoluteUnaligned(axis)
-        ids.append(model.addJoint(ids[tree.parent[j] + 1], kind, pin.SE3(tree.T_parent_joint[j]), name))
-    for name, joint, T in zip(frames, tree.frame_joint, tree.T_joint_frame, strict=True):
-        model.addFrame(pin.Frame(name, ids[joint + 1], 0, pin.SE3(T), pin.FrameType.OP_FRAME))
-    return model
 
 
 def _joint_hull(parts_m: Parts) -> F32:
@@ -230,53 +185,3 @@ def _meshes(parts_m: Parts) -> Mesh:
 def _plain(corners_m: F32) -> Mesh:
     faces, _ = hull_faces(corners_m)
     return Mesh(corners_m, faces, np.full((len(faces), 3), _GREY, np.uint8))
-
-
-def _damped_step(J: F64, error: F64, squared: float) -> F64:
-    """Change (A,) of the coordinates by the Jacobian (6, A) and the twist (6,) that is left."""
-    H = J.dot(J.T)
-    H.flat[::7] += _DAMPING + _DAMPING_PER_ERROR * squared
-    return J.T.dot(_lapack.dposv(H, error)[1])
-
-
-def solve(
-    model: Any, data: Any, frame: int, coordinates: Coordinates, T_base_tcp: F64, q_seed_rad: F64
-) -> F64 | None:
-    """Coordinates (A,) within their limits that put the frame at the pose (4, 4), or None.
-
-    Levenberg-Marquardt with damping that grows with the squared error (Sugihara 2011), on the pose error
-    as a twist in the frame itself; a joint at its limit stays there while the step pushes it out.
-    """
-    low, high, has_slides = coordinates.lower, coordinates.upper, bool(coordinates.slides.any())
-    goal = pin.SE3(T_base_tcp)
-    q = np.minimum(np.maximum(q_seed_rad, low), high)
-    best, best_at = np.inf, 0
-    for step in range(_MAX_STEPS):
-        pin.computeJointJacobians(model, data, coordinates(q))
-        here = pin.updateFramePlacement(model, data, frame)
-        error = pin.log6(here.actInv(goal)).vector
-        # Plain floats and ndarray.dot: half of the time would go into the wrappers around them.
-        x, y, z, a, b, c = error.tolist()
-        distance, angle = x * x + y * y + z * z, a * a + b * b + c * c
-        if distance < POSITION_TOLERANCE_M**2 and angle < ANGLE_TOLERANCE_RAD**2:
-            return q
-        squared = distance + angle
-        if squared < _PROGRESS**2 * best:
-            best, best_at = squared, step
-        elif step - best_at >= _PATIENCE:
-            return None
-        J = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL)
-        if not coordinates.are_joints:
-            J = J @ coordinates.matrix
-        dq = _damped_step(J, error, squared)
-        if has_slides:
-            # A lift is at a limit in many poses: the other coordinates take over. Arms that only turn keep
-            # the bits of their labels.
-            while (stuck := ((q <= low) & (dq < 0)) | ((q >= high) & (dq > 0))).any():
-                J = J * ~stuck
-                dq = _damped_step(J, error, squared)
-        longest = max(map(abs, dq.tolist()))
-        if longest > _LONGEST_STEP_RAD:
-            dq *= _LONGEST_STEP_RAD / longest
-        q = np.minimum(np.maximum(q + dq, low), high)
-    return None
