@@ -191,8 +191,8 @@ def _near_grasps(search: _Search, rows: list[int]) -> MotionPlan | None:
         if len(T) == 0:
             break
         each = _NEARBY // len(T)
-        T, opening, motion = (np.repeat(a, each, axis=0) for a in (T, opening, motion))
-        T, motion = _varied(T, motion, search.rng)
+        opening = np.repeat(opening, each)
+        T, motion = _varied(np.repeat(T, each, axis=0), np.repeat(motion, each, axis=0), search.rng)
         poses, stages = Poses.unknown(T, opening), dict[int, int]()
         order = search.best_first(in_memory(poses), 0, len(T), np.full(0, -1))
         plan = search.try_poses(poses, order[:_NEARBY_TRIED], False, stages) or search.search_paths()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
@@ -149,13 +150,15 @@ def hand_scene(
     still = still_of([*static, *objects[0], *others], kinds)
     # The hand is never farther from the target than this: the other parts need no check.
     center, room_m = scene.target_center_m, _HAND_ROOM_M + max(limits.pregrasp_m, limits.lift_m)
-    near = (still.low_m < center + room_m) & (still.high_m > center - room_m)
-    near[len(static) :] = True
-    room = in_memory(Room(still, np.flatnonzero(near.all(axis=1))))
+    near = np.flatnonzero(
+        ((still.low_m < center + room_m) & (still.high_m > center - room_m)).all(axis=1)
+        | (np.arange(len(kinds)) >= len(static))
+    )
+    room = in_memory(Room(still, near))
     hand, grasp, T_object_tcp, opening = _clear_poses(gripper, grasps, target, limits)
     first = int(np.searchsorted(grasp, per_scene))
     of_others = np.arange(len(static) + len(objects[0]), len(still.kind))
-    of_static = np.flatnonzero(near.all(axis=1)[: len(static)])
+    of_static = near[near < len(static)]
     if _is_sunk(target, T_world_target, in_memory(still), of_others) or not _can_be_lifted(
         target, T_world_target, in_memory(still), of_static, limits.lift_m
     ):
@@ -244,9 +247,9 @@ def _can_be_lifted(
     return not hit_any(_core(target, TOUCH_M), T, still, static)
 
 
-def still_of(parts_m: list[F64] | tuple[F32, ...], kinds: list[int]) -> Still:
+def still_of(parts_m: Sequence[F32 | F64], kinds: Sequence[int]) -> Still:
     """Parts that do not move, each (V, 3)."""
-    points = np.concatenate([np.zeros((0, 3)), *parts_m])
+    points = np.concatenate([np.zeros((0, 3)), *parts_m], dtype=np.float64)
     first = np.cumsum([0, *map(len, parts_m)])
     if len(parts_m) == 0:
         return Still(points, first, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64))

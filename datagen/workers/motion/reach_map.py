@@ -8,17 +8,22 @@ front first, so that this joint need not be sampled; for others the azimuth is o
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from typing import NamedTuple
 
 import numpy as np
 
 from datagen.workers.geometry.mesh import F32, F64, I32
-from datagen.workers.kinematics.compiler import compiled, struct
+from datagen.workers.kinematics.compiler import compiled, in_memory, struct
 from datagen.workers.kinematics.inverse import joint_poses, tcp_pose
 from datagen.workers.kinematics.tree import Ints, KinematicTree
 
-_DISTANCES, _HEIGHTS, _SIDES, _ROLLS, AZIMUTHS = 16, 32, 3, 8, 12
+_DISTANCES, _HEIGHTS, _SIDES, _ROLLS, _AZIMUTHS = 16, 32, 3, 8, 12
 _DIRECTIONS = 6 * _SIDES * _SIDES  # cells on the faces of a cube
+_SAMPLES = 1 << 19  # joint vectors of a map
+_FIRST_SAMPLES = 1 << 14  # those that decide how far it extends
+_DIGITS = 6  # of an arm's numbers, in units of its length: scaled copies of an arm share samples
+_MAPS_KEPT = 16
 _APART = 1.0  # seeds with all coordinates nearer than this often lead to one solution
 _MOST_NEAR = 24  # samples among which seeds are chosen
 
@@ -88,7 +93,7 @@ def _cell(distance: float, height: float, azimuth: float, a: F64, c: F64, turns:
     at = ((i * _HEIGHTS + k) * _DIRECTIONS + (face * _SIDES + m) * _SIDES + n) * _ROLLS + r
     if turns:
         return at
-    return at * AZIMUTHS + min(int((azimuth / (2 * math.pi) + 0.5) * AZIMUTHS), AZIMUTHS - 1)
+    return at * _AZIMUTHS + min(int((azimuth / (2 * math.pi) + 0.5) * _AZIMUTHS), _AZIMUTHS - 1)
 
 
 @compiled
@@ -125,8 +130,8 @@ def cells_near(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> float:
         return azimuth
     a, c = feature[2:5], feature[5:8]
     cells[0] = _cell(distance, height, azimuth, a, c, turns)
-    step = _ROLLS * _DIRECTIONS * (1 if turns else AZIMUTHS)
-    per = 1 if turns else AZIMUTHS
+    step = _ROLLS * _DIRECTIONS * (1 if turns else _AZIMUTHS)
+    per = 1 if turns else _AZIMUTHS
     i, k, r = cells[0] // (step * _HEIGHTS), cells[0] // step % _HEIGHTS, cells[0] // per % _ROLLS
     if i > 0:
         cells[1] = cells[0] - step * _HEIGHTS
@@ -149,7 +154,7 @@ def score(reach: ReachMap, T: F64, w: ReachWork) -> int:
     for k in range(7):
         if cells[k] >= 0:
             total += (8 if k == 0 else 1) * (first[cells[k] + 1] - first[cells[k]])
-    return total
+    return int(total)
 
 
 @compiled
@@ -193,7 +198,7 @@ def seeds(reach: ReachMap, tree: KinematicTree, T: F64, out: F64, w: ReachWork) 
 
 
 @compiled
-def fill(reach: ReachMap, tree: KinematicTree, q: F64, cell: Ints, features: F64) -> None:
+def _fill(reach: ReachMap, tree: KinematicTree, q: F64, cell: Ints, features: F64) -> None:
     """Cells (N,) and features (N, 8) of joint vectors (N, A), which are turned to the front in place."""
     joints, T, root = np.empty((len(tree.parent), 3, 4)), np.empty((3, 4)), np.zeros((3, 4))
     root[0, 0] = root[1, 1] = root[2, 2] = 1.0
@@ -207,4 +212,84 @@ def fill(reach: ReachMap, tree: KinematicTree, q: F64, cell: Ints, features: F64
             q[k, reach.turn] -= azimuth
 
 
-CELLS = _DISTANCES * _HEIGHTS * _DIRECTIONS * _ROLLS
+def reach_map(tree: KinematicTree, draw: int = 0) -> ReachMap:
+    """Where the tree's hand can be. Trees that differ by their scale alone share the samples.
+
+    `draw` seeds the samples.
+    """
+    length_m = float(np.linalg.norm(tree.T_parent_joint[:, :3, 3], axis=1).sum())
+    turn, axis_xy_m = _upright(tree)
+    unit = np.ones(len(tree.lower))
+    unit[tree.coordinate[tree.slides]] = length_m
+    one = _in_units(tree, length_m, unit)
+    key = (*(a.tobytes() for a in one), turn, draw)
+    if key not in _known:
+        _known[key] = _samples(one, turn, _rounded(axis_xy_m / length_m), draw)
+    _known.move_to_end(key)
+    if len(_known) > _MAPS_KEPT:
+        _known.popitem(last=False)
+    first, q, half = _known[key]
+    if (unit != 1.0).any():
+        q = (q * unit).astype(np.float32)
+    R, t_m = tree.T_joint_frame[-1, :3, :3], tree.T_joint_frame[-1, :3, 3]
+    return ReachMap(first, q, axis_xy_m, turn, -(R.T @ t_m), half * length_m)
+
+
+_known: OrderedDict[tuple[object, ...], tuple[I32, F32, float]] = OrderedDict()
+
+
+def _rounded(values: F64) -> F64:
+    return np.round(values, _DIGITS) + 0.0  # no negative zero
+
+
+def _in_units(tree: KinematicTree, length_m: float, unit: F64) -> KinematicTree:
+    """The tree with its length as unit, its wrist as TCP, rounded: equal for scaled copies of an arm."""
+    T, T_wrist = tree.T_parent_joint.copy(), tree.T_joint_frame[-1:].copy()
+    T[:, :3, 3] /= length_m
+    T_wrist[:, :3, 3] = 0.0
+    return tree._replace(
+        T_parent_joint=_rounded(T),
+        offset=_rounded(np.where(tree.slides, tree.offset / length_m, tree.offset)),
+        lower=_rounded(np.maximum(tree.lower, -np.pi) / unit),
+        upper=_rounded(np.minimum(tree.upper, np.pi) / unit),
+        frame_joint=tree.frame_joint[-1:],
+        T_joint_frame=_rounded(T_wrist),
+    )
+
+
+def _samples(one: KinematicTree, turn: int, axis_xy: F64, draw: int) -> tuple[I32, F32, float]:
+    """First rows of the cells (C + 1,), joint vectors (N, A), half the map's width, in the tree's units."""
+    rng = np.random.Generator(np.random.PCG64(draw))
+    q = rng.uniform(one.lower, one.upper, (_SAMPLES, len(one.lower)))
+    cell, features = np.empty(len(q), np.int64), np.empty((len(q), 8))
+    reach = ReachMap(np.zeros(1, np.int32), q[:0].astype(np.float32), axis_xy, turn, np.zeros(3), 1.0)
+    tree, some = in_memory(one), q[:_FIRST_SAMPLES].copy()
+    _fill(in_memory(reach), tree, some, cell[: len(some)], features)
+    half = 1.02 * float(np.abs(features[: len(some), :2]).max())
+    _fill(in_memory(reach._replace(half_m=half)), tree, q, cell, features)
+    order = np.argsort(cell, kind="stable")
+    count = _DISTANCES * _HEIGHTS * _DIRECTIONS * _ROLLS * (1 if turn >= 0 else _AZIMUTHS)
+    first = np.searchsorted(cell[order], np.arange(count + 1)).astype(np.int32)
+    return first, q[order].astype(np.float32), half
+
+
+def _upright(tree: KinematicTree) -> tuple[int, F64]:
+    """The coordinate of the first joint that turns, if about a vertical axis, and that axis's x and y (2,).
+
+    Joints below it may slide up and down; -1 where there is none.
+    """
+    way, j = list[int](), int(tree.frame_joint[-1])
+    while j >= 0:
+        way.append(j)
+        j = int(tree.parent[j])
+    T = np.eye(4)
+    for j in reversed(way):
+        T = T @ tree.T_parent_joint[j]
+        axis = T[:3, :3] @ tree.axis[j]
+        if np.abs(axis[:2]).max() > 1e-6:
+            break
+        if not tree.slides[j]:
+            # A joint that turns the other way would need the opposite azimuth.
+            is_plain = axis[2] > 0 and tree.ratio[j] == 1.0
+            return (int(tree.coordinate[j]), T[:2, 3].copy()) if is_plain else (-1, np.zeros(2))
+    return -1, np.zeros(2)

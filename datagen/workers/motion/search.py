@@ -60,7 +60,7 @@ def samples_near(s: Search, poses: Poses, start: int, end: int, near: Ints, shor
     for k in range(start, end):
         if not poses.allowed[k]:
             continue
-        count = 1
+        count, place = 1, 0
         for place in range(3):  # the grasp, its pregrasp, the end of the lift
             moved(
                 poses.T_world_tcp[k],
