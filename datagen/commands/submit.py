@@ -121,6 +121,10 @@ class SubmitOptions(JobOptions):
             ROBOT,
         ),
     ] = None
+    draws: Annotated[
+        Whole | None,
+        option("Independent plans per candidate, whose rate is stored; plan labels. [default: 1]", ROBOT),
+    ] = None
     dry_run: Annotated[
         bool,
         option("Check everything, make nothing; print shards, scenes, unusable houses and objects.", RUNNING),
@@ -196,7 +200,7 @@ def _specified(options: SubmitOptions, shown: Progress) -> tuple[Run | None, Man
     """
     run, label_source = _existing_run(str(options.out)), options.label_source
     config = None if options.config is None else Path(options.config)
-    chosen = options.robot, options.perturb
+    chosen = options.robot, options.perturb, options.draws
     surveys: Mapping[str, Survey] = {}
     if options.scenes_from is None:
         houses, objects = options.houses or "builtin", options.objects or "builtin"

@@ -63,10 +63,12 @@ def specify(
     config: Path | None,
     robot: str | None = None,
     repeats: int | None = None,
+    draws: int | None = None,
 ) -> Specification:
     """Return the specification of the options (dotted names, None where not given) and the file.
 
-    An option overrides the file, and the file the default. `robot` and `repeats` are --robot and --perturb.
+    An option overrides the file, and the file the default. `robot`, `repeats` and `draws` are --robot,
+    --perturb and --draws.
     Raises InputError for an option, for a field of the file, and for an engine that cannot be imported here.
     """
     place = str(config) if config else "options"
@@ -78,7 +80,7 @@ def specify(
     if isinstance(settle, dict):
         # SAPIEN where it can be imported, else the first that can; the choice is recorded.
         settle.setdefault("engine", first_settler())
-    complete_arm(label_source, fields, robot, repeats, place)
+    complete_arm(label_source, fields, robot, repeats, place, draws)
     chosen = robot_of(fields, robot)
     if chosen is not None:
         narrow_candidates(fields, chosen)
@@ -192,13 +194,23 @@ def refuse_missing_packages(label_source: str) -> None:
 
 
 def complete_arm(
-    label_source: str, fields: Fields, robot: str | None, repeats: int | None, place: str
+    label_source: str,
+    fields: Fields,
+    robot: str | None,
+    repeats: int | None,
+    place: str,
+    draws: int | None = None,
 ) -> None:
     """Fill in the section `arm` of a specification's fields for this label source.
 
-    `robot` and `repeats` are the options --robot and --perturb, and override the section that came from
-    `place`. Raises InputError for what the label source does not support.
+    `robot`, `repeats` and `draws` are the options --robot, --perturb and --draws, and override the section
+    that came from `place`. Raises InputError for what the label source does not support.
     """
+    if draws is not None and (label_source != "plan" or repeats is not None):
+        problem = "is for plan labels without --perturb"
+        raise InputError("--draws", str(draws), problem, "Omit one of them, or submit plan")
+    if draws is not None and not 2 <= draws <= 100:
+        raise InputError("--draws", str(draws), "is not 2 to 100", "Omit it for one draw")
     if repeats is not None and label_source not in ARM_PACKAGES:
         fix = "Omit it, or submit plan or sim"
         raise InputError("--perturb", str(repeats), f"{label_source} has no arm", fix)
@@ -229,6 +241,8 @@ def complete_arm(
         motion.setdefault("nearby_rounds", _NEARBY_ROUNDS)
     if label_source == "sim":
         arm.setdefault("trial", {})
+    if draws is not None:
+        arm["draws"] = draws
     if repeats is not None:
         disturbance = arm.setdefault("disturbance", {})
         if isinstance(disturbance, dict):

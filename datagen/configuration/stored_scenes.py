@@ -75,6 +75,7 @@ def specify_again(
     config: Path | None,
     robot: str | None = None,
     repeats: int | None = None,
+    draws: int | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Specification:
     """Return the stored run's specification with another label source or other parameters of labels.
@@ -94,13 +95,14 @@ def specify_again(
         put_field(chosen, name, value, config)
     fields = before.model_dump(mode="json", exclude_none=True)
     arm = fields.pop("arm", {})
-    # The robot and its planning stay; disturbances are chosen for each run.
+    # The robot and its planning stay; disturbances and draws are chosen for each run.
     arm.pop("disturbance", None)
+    arm.pop("draws", None)
     if label_source != before.label_source:
         arm.pop("trial", None)
     defaults = {"arm": arm} if arm and label_source in ARM_PACKAGES else {}
     fields = _merged(fields | defaults, chosen)
-    complete_arm(label_source, fields, robot, repeats, place)
+    complete_arm(label_source, fields, robot, repeats, place, draws)
     suited = robot_of(fields, robot)
     engines = {name: v for name, v in before.engines.items() if name in scene_engine_names(before)}
     fields |= {

@@ -227,7 +227,7 @@ _PLANNED_FIELDS = (
 PLAN_FIELDS = (
     *_PLANNED_FIELDS,
     Field("trials", "int16", (), "1", "",
-          "arrivals that were planned from: repeats, or 1, the candidate itself; 0 where nothing was planned",
+          "what was planned: arrivals, draws, or 1, the candidate itself; 0 where nothing was planned",
           0),
     Field("successes", "int16", (), "1", "", "those with a whole plan; the label is the candidate's own", 0),
 )

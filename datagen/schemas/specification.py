@@ -226,8 +226,16 @@ class ArmParams(_Frozen):
     joints: int | None = Field(default=None, ge=1, le=9)  # coordinates of the arm; None: seven
     grasps: GraspParams = GraspParams()
     motion: MotionParams = MotionParams()
+    # Independent draws of grasps, seeds and paths that the planner makes for a candidate; None: one.
+    draws: int | None = Field(default=None, ge=2, le=100)
     trial: TrialParams | None = None
     disturbance: DisturbanceParams | None = None
+
+    @model_validator(mode="after")
+    def _one_repeats(self) -> ArmParams:
+        if self.draws is not None and (self.trial is not None or self.disturbance is not None):
+            raise ValueError("draws are for plan labels without disturbance")
+        return self
 
     @property
     def robot_key(self) -> str:

@@ -16,12 +16,16 @@ RATE_FIELDS = ("trials", "successes")
 
 
 def rate_fields(parts: Sequence[RunPart]) -> tuple[str, ...]:
-    """`RATE_FIELDS` where a run's trials are disturbed and all runs hold them; else (), to use labels."""
-    disturbed = any(spec.arm is not None and spec.arm.disturbance for part in parts for spec in part.specs)
+    """`RATE_FIELDS` where a run repeats its trials and all runs hold them; else (), to use labels."""
+    repeated = any(
+        spec.arm is not None and (spec.arm.disturbance or spec.arm.draws)
+        for part in parts
+        for spec in part.specs
+    )
     held = all(
         set(RATE_FIELDS) <= {field.name for field in SCHEMAS[part.schema].sample_fields} for part in parts
     )
-    return RATE_FIELDS if disturbed and held else ()
+    return RATE_FIELDS if repeated and held else ()
 
 
 def label_losses(logits: Tensor, batch: Batch[Tensor]) -> Tensor:

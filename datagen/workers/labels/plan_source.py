@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from datagen.schemas.fields import OUTCOMES
@@ -22,7 +24,7 @@ from datagen.workers.motion import MotionPlan
 from datagen.workers.scenes import SettledScene
 from datagen.workers.watched_clock import count_label
 
-# 3: four different seeds of inverse kinematics for each grasp.
+# 4: planned by machine code; all free grasps in reach are tried, then poses near them.
 VERSION = 4
 _CODES = {name: code for code, name in enumerate(OUTCOMES)}
 
@@ -53,17 +55,25 @@ def label_with_trials(
         "trials": np.zeros(n, np.int16),
         "successes": np.zeros(n, np.int16),
     }
-    arms: dict[tuple[float, float], ArmInScene] = {}
-    trials: list[CandidateTrial] = []
+    arms: dict[tuple[float, float, int], ArmInScene] = {}
+    draws, trials = arm_of(spec).draws or 1, list[CandidateTrial]()
     for row in range(n):
-        key = (float(candidates.arm_reach_m[row]), float(candidates.base_height_m[row]))
-        if key not in arms:
-            arms[key] = arm_in_scene(scene, candidates, row, spec, clock)
-        trial = try_candidate(arms[key], candidates, row, spec)
+        by_draw = list[CandidateTrial]()
+        reach_m, height_m = float(candidates.arm_reach_m[row]), float(candidates.base_height_m[row])
+        for draw in range(draws):
+            key = (reach_m, height_m, draw)
+            if key not in arms:
+                arms[key] = arm_in_scene(scene, candidates, row, spec, clock, draw)
+            by_draw.append(try_candidate(arms[key], candidates, row, spec))
+        trial = by_draw[0]
+        if draws > 1:
+            plans, tries = sum(t.successes for t in by_draw), sum(t.trials for t in by_draw)
+            trial = replace(trial, successes=plans, trials=tries)
         trials.append(trial)
         _write(columns, row, trial)
         if trial.plan is not None:
-            _write_plan(columns, row, arms[key], arms[key].base_pose(candidates, row), trial.plan)
+            at = arms[reach_m, height_m, 0]
+            _write_plan(columns, row, at, at.base_pose(candidates, row), trial.plan)
         count_label(clock)
     columns["label"] = (columns["outcome"] == _CODES["success"]).astype(np.uint8)
     return columns, trials

@@ -12,7 +12,7 @@ from datagen.workers.labels import Columns, LabelSource, plan_source
 from datagen.workers.scenes import SettledScene
 
 # 2: the first grasp alone decides, lift and slip are measured at the grasp, thrown objects are `unstable`.
-# 3: four different seeds of inverse kinematics for each grasp.
+# 4: plans are those of `plan` labels of version 4.
 VERSION = 4
 _RETRY_CODES = {name: code for code, name in enumerate(RETRY_OUTCOMES)}
 

@@ -79,6 +79,24 @@ def test_contradictions_are_refused(
     assert all(word in str(error.value) for word in words), str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("source", "repeats", "draws", "words"),
+    [
+        ("heuristic", None, 3, ["--draws: 3:", "submit plan"]),
+        ("sim", None, 3, ["--draws: 3:", "submit plan"]),
+        ("plan", 2, 3, ["--draws: 3:", "--perturb"]),
+        ("plan", None, 1, ["--draws: 1:", "2 to 100"]),
+        ("plan", None, 101, ["--draws: 101:", "2 to 100"]),
+    ],
+)
+def test_draws_that_nothing_makes_are_refused(
+    source: str, repeats: int | None, draws: int, words: list[str]
+) -> None:
+    with pytest.raises(InputError) as error:
+        complete_arm(source, {}, None, repeats, "run.toml", draws)
+    assert all(word in str(error.value) for word in words), str(error.value)
+
+
 def test_the_robot_is_that_of_the_option_or_of_the_arm() -> None:
     assert robot_of({}, None) is None
     assert robot_of({}, "panda") == "panda"
