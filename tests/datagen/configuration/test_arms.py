@@ -22,6 +22,7 @@ from datagen.schemas.specification import (
     ArmParams,
     CandidateParams,
     DisturbanceParams,
+    MotionParams,
     Specification,
     TrialParams,
 )
@@ -40,13 +41,15 @@ def completed(
 
 
 def test_each_label_source_gets_the_sections_it_has() -> None:
+    near, disturbed = MotionParams(nearby_rounds=3), DisturbanceParams(repeats=3)
     assert completed("heuristic") is None
-    assert completed("plan") == ArmParams()
-    assert completed("plan", repeats=3) == ArmParams(disturbance=DisturbanceParams(repeats=3))
-    assert completed("sim") == ArmParams(trial=TrialParams())
-    assert completed("sim", repeats=3) == ArmParams(
-        trial=TrialParams(), disturbance=DisturbanceParams(repeats=3)
+    assert completed("plan") == ArmParams(motion=near)
+    assert completed("plan", {"arm": {"motion": {"nearby_rounds": 0}}}) == ArmParams(
+        motion=MotionParams(nearby_rounds=0)
     )
+    assert completed("plan", repeats=3) == ArmParams(motion=near, disturbance=disturbed)
+    assert completed("sim") == ArmParams(motion=near, trial=TrialParams())
+    assert completed("sim", repeats=3) == ArmParams(motion=near, trial=TrialParams(), disturbance=disturbed)
 
 
 def test_the_option_wins_over_the_file_and_the_file_over_the_default() -> None:

@@ -161,6 +161,24 @@ def test_the_first_grasp_decides_and_later_ones_are_stored(monkeypatch: pytest.M
     assert "none" not in retries[:3] and set(retries[3:]) == {"none"}
 
 
+def test_draws_are_counted_and_the_first_is_stored(labelled: dict[str, Any]) -> None:
+    at, spec = scene(), specification(draws=3)
+    columns, one = label(spec, at), labelled["plan"]
+    assert {name for name in columns if not np.array_equal(columns[name], one[name])} == {
+        "trials",
+        "successes",
+    }
+    np.testing.assert_array_equal(columns["trials"], 3 * one["trials"])
+    found = np.zeros(3, int)
+    for draw in range(3):
+        arms = (arm_in_scene(at, candidates(at), row, spec, StageClock(), draw) for row in range(3))
+        plans = [try_candidate(arm, candidates(at), row, spec).plan for row, arm in enumerate(arms)]
+        found += [plan is not None for plan in plans]
+        if draw:
+            assert plans[0] is not None and plans[0].length_rad != one["path_length_rad"][0]
+    np.testing.assert_array_equal(columns["successes"][:3], found)
+
+
 def test_repeats_are_counted() -> None:
     wild = DisturbanceParams(repeats=4, target_position_std_m=0.02, base_position_std_m=0.15)
     columns = label(specification(trial=TrialParams(), disturbance=wild))
