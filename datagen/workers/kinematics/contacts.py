@@ -194,17 +194,8 @@ def _place(parts: Parts, T: F64, s: Scratch) -> None:
 
 @compiled
 def _pair_touches(parts: Parts, a: int, b: int, T: F64, axis: F64, s: Scratch) -> bool:
-    """Whether two parts touch, after `_place`: by boxes, each along the axes of the other, then exactly."""
-    owner, centers, halves, first = parts.owner, parts.center_m, parts.half_m, parts.first
-    placed, radii, M = s.center_m, s.half_m, s.relative
-    x, y, z = (
-        placed[a, 0] - placed[b, 0],
-        placed[a, 1] - placed[b, 1],
-        placed[a, 2] - placed[b, 2],
-    )
-    reach = radii[a, 0] + radii[b, 0]
-    if x * x + y * y + z * z > reach * reach:
-        return False
+    """Whether two parts touch: by boxes, each along the axes of the other, then exactly."""
+    owner, centers, halves, first, M = parts.owner, parts.center_m, parts.half_m, parts.first, s.relative
     _relative(T[owner[a]], T[owner[b]], M)
     c, h, low, half, m = centers[a], halves[a], centers[b], halves[b], s.v
     for i in range(3):
@@ -229,8 +220,12 @@ def hits_itself(parts: Parts, pairs: Ints, T: F64, axes: F64, s: Scratch) -> boo
     `axes` (K, 3) keeps a direction between each two parts; `s` is that of `own_scratch`.
     """
     _place(parts, T, s)
+    placed, radii = s.center_m, s.half_m
     for k in range(len(pairs)):
-        if _pair_touches(parts, pairs[k, 0], pairs[k, 1], T, axes[k], s):
+        a, b = pairs[k, 0], pairs[k, 1]
+        x, y, z = placed[a, 0] - placed[b, 0], placed[a, 1] - placed[b, 1], placed[a, 2] - placed[b, 2]
+        reach = radii[a, 0] + radii[b, 0]
+        if x * x + y * y + z * z <= reach * reach and _pair_touches(parts, a, b, T, axes[k], s):
             return True
     return False
 
@@ -238,7 +233,6 @@ def hits_itself(parts: Parts, pairs: Ints, T: F64, axes: F64, s: Scratch) -> boo
 @compiled
 def touching_pairs(parts: Parts, pairs: Ints, T: F64, s: Scratch, out: Bools) -> None:
     """Which pairs (K, 2) of the parts touch, into out (K,), their owners posed by T (O, 3, 4)."""
-    _place(parts, T, s)
     axis = np.empty(3)
     for k in range(len(pairs)):
         axis[0] = axis[1] = axis[2] = 0.0

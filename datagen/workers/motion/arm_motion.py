@@ -96,14 +96,32 @@ class Search(NamedTuple):
     work: Work
 
 
-struct(Search)
+_new_search = struct(Search)
 
 
 @compiled
-def workspace(arm: Arm, hand: Hand, room: Room, back: F64, lift: F64, without_path: Ints) -> Work:
-    """Arrays for one base pose: no result depends on earlier ones."""
+def _is_stuck(arm: Arm, room: Room, T_root: F64, rows: Ints, w: Work) -> bool:
+    """Whether links that no joint moves collide with anything but the floor."""
+    frame_poses(arm.tree, T_root, w.joints, w.frames)
+    scratch = scratch_of(len(arm.fixed.owner), len(room.still.kind))
+    return hits_still(arm.fixed, ONE_SHAPE, w.frames, room.still, rows, FLOOR, 0.0, scratch)
+
+
+@compiled
+def search_at(
+    arm: Arm,
+    hand: Hand,
+    room: Room,
+    limits: Limits,
+    T_root: F64,
+    rows: Ints,
+    back: F64,
+    lift: F64,
+    without_path: Ints,
+) -> Search:
+    """The search at a base pose; its arrays are new, so that no result depends on earlier ones."""
     still, count = len(room.still.kind), len(arm.weight)
-    return new_work(
+    work = new_work(
         np.empty((len(arm.tree.parent), 3, 4)),
         np.empty((len(arm.tree.frame_joint) + 1, 3, 4)),
         ik_workspace(arm.tree),
@@ -117,6 +135,8 @@ def workspace(arm: Arm, hand: Hand, room: Room, back: F64, lift: F64, without_pa
         lift,
         without_path,
     )
+    stuck = _is_stuck(arm, room, T_root, rows, work)
+    return _new_search(arm, hand, room, limits, T_root, rows, stuck, work)
 
 
 @compiled
@@ -126,14 +146,6 @@ def pose_arm(s: Search, q: F64) -> None:
     joint_poses(tree, s.T_root, q, w.joints)
     frame_poses(tree, s.T_root, w.joints, w.frames)
     put(s.T_root, w.frames[-1])
-
-
-@compiled
-def is_stuck(arm: Arm, room: Room, T_root: F64, rows: Ints, w: Work) -> bool:
-    """Whether links that no joint moves collide with anything but the floor."""
-    frame_poses(arm.tree, T_root, w.joints, w.frames)
-    scratch = scratch_of(len(arm.fixed.owner), len(room.still.kind))
-    return hits_still(arm.fixed, ONE_SHAPE, w.frames, room.still, rows, FLOOR, 0.0, scratch)
 
 
 @compiled

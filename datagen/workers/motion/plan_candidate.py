@@ -11,7 +11,7 @@ from datagen.workers.geometry.transforms import inverse
 from datagen.workers.kinematics.compiler import in_memory
 from datagen.workers.kinematics.tree import Bools, Ints
 from datagen.workers.motion import MotionPlan, PlanReport
-from datagen.workers.motion.arm_motion import Search, is_stuck, workspace
+from datagen.workers.motion.arm_motion import search_at
 from datagen.workers.motion.hand_motion import Poses, points_on
 from datagen.workers.motion.path_search import dense
 from datagen.workers.motion.planning_scene import ROOM_AROUND_M, PlanningScene
@@ -83,9 +83,9 @@ class _Search:
         self.back = np.empty((_SEARCHES + 1, back, count))  # lines of grasps, as `Work` has them
         self.lift = np.empty((_SEARCHES + 1, rise, count))
         self.found = np.zeros(1, np.int64)
-        work = workspace(*at, self.back, self.lift, self.found)
-        stuck = is_stuck(scene.arm, around.room, self.T_root, rows, work)
-        self.compiled = in_memory(Search(*at, scene.compiled_limits, self.T_root, rows, stuck, work))
+        self.compiled = search_at(
+            *at, scene.compiled_limits, self.T_root, rows, self.back, self.lift, self.found
+        )
 
     def best_first(self, poses: Poses, start: int, end: int, short: Ints) -> Ints:
         """The free poses from `start` to `end` that can be reached, those with most samples near first."""

@@ -55,32 +55,36 @@ def samples_near(s: Search, poses: Poses, start: int, end: int, near: Ints, shor
     The least of those near the pose, near its pregrasp and near the end of its lift; 0 at other poses. Poses
     that can be reached and not lifted go to `short`, behind those that are there, while there is room.
     """
-    limits = s.limits
-    pose, local, work = np.empty((3, 4)), s.work.reach.local, s.work.reach
+    # Fields are read once: each time costs more than a line of this.
+    limits, hand, room, reach, hand_work = s.limits, s.hand, s.room, s.arm.reach, s.work.hand
+    T_root, T_world, allowed, local, work = (
+        s.T_root,
+        poses.T_world_tcp,
+        poses.allowed,
+        s.work.reach.local,
+        s.work.reach,
+    )
+    pregrasp_m, lift_m, shorts = limits.pregrasp_m, limits.lift_m, 0
+    while shorts < len(short) and short[shorts] >= 0:
+        shorts += 1
     for k in range(start, end):
-        if not poses.allowed[k]:
+        if not allowed[k]:
             continue
-        count, place = 1, 0
-        for place in range(3):  # the grasp, its pregrasp, the end of the lift
-            moved(
-                poses.T_world_tcp[k],
-                limits.pregrasp_m if place == 1 else 0.0,
-                limits.lift_m if place == 2 else 0.0,
-                pose,
-            )
-            _inverse_times(s.T_root, pose, local)
-            here = score(s.arm.reach, local, work)
-            count = here if place == 0 else min(count, here)
-            if count == 0:
-                break
-        if (count == 0 and place < 2) or not is_hand_free(s.hand, s.room, limits, poses, k, s.work.hand):
+        _inverse_times(T_root, T_world[k], local)
+        count = score(reach, local, work)
+        if count > 0:  # the pregrasp
+            for i in range(3):
+                local[i, 3] -= pregrasp_m * local[i, 2]
+            count = min(count, score(reach, local, work))
+        if count == 0 or not is_hand_free(hand, room, limits, poses, k, hand_work):
             continue
+        for i in range(3):  # the end of the lift
+            local[i, 3] += pregrasp_m * local[i, 2] + lift_m * T_root[2, i]
+        count = min(count, score(reach, local, work))
         near[k - start] = count
-        if count == 0:
-            for m in range(len(short)):
-                if short[m] < 0:
-                    short[m] = k
-                    break
+        if count == 0 and shorts < len(short):
+            short[shorts] = k
+            shorts += 1
 
 
 @compiled
