@@ -16,7 +16,7 @@ from datagen.workers.motion.hand_motion import Poses, points_on
 from datagen.workers.motion.path_search import dense
 from datagen.workers.motion.planning_scene import ROOM_AROUND_M, PlanningScene
 from datagen.workers.motion.search import (
-    NO_APPROACH,
+    ARM_COLLISION,
     NO_LIFT,
     NO_START,
     SUCCESS,
@@ -54,7 +54,7 @@ def plan_candidate(
     search = _Search(prepared, np.ascontiguousarray(T_world_base[:3]), rng)
     stages = dict[int, int]()
     plan = _among_grasps(search, allowed, stages)
-    if plan is None and search.furthest >= NO_APPROACH:
+    if plan is None and search.furthest not in (ARM_COLLISION, NO_START):
         plan = _near_grasps(search, _furthest(stages))
     outcome = STAGES[search.furthest] if plan is None else "success"
     return PlanReport(outcome, plan, around.grasps_free, search.tried)
