@@ -13,11 +13,11 @@ pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run 
 
 from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.geometry.transforms import inverse
+from datagen.workers.kinematics.tree import frame_poses
 from datagen.workers.robots import robot_limits
 from datagen.workers.robots.arm_chain import FEWEST, MOST, TURN
 from datagen.workers.robots.assembly import read_trees
 from datagen.workers.robots.hulls import MAX_CORNERS, polyhedron
-from datagen.workers.kinematics.tree import frame_poses
 from datagen.workers.robots.links import position_of
 from datagen.workers.robots.robot import Robot
 from tests.workers.robots.robots_under_test import CASES, opened
