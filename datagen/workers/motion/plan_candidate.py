@@ -192,8 +192,8 @@ def _near_grasps(search: _Search, rows: list[int]) -> MotionPlan | None:
             break
         each = _NEARBY // len(T)
         T, opening, motion = (np.repeat(a, each, axis=0) for a in (T, opening, motion))
-        T, motion = _varied(T, motion, search.rng)
-        poses, stages = Poses.unknown(T, opening), dict[int, int]()
+        near, motion = _varied(T, motion, search.rng)
+        poses, stages = Poses.unknown(near, opening), dict[int, int]()
         order = search.best_first(in_memory(poses), 0, len(T), np.full(0, -1))
         plan = search.try_poses(poses, order[:_NEARBY_TRIED], False, stages) or search.search_paths()
         if plan is not None:
