@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar, cast
@@ -17,7 +18,15 @@ _Tuple = TypeVar("_Tuple", bound=NamedTuple)
 
 def compiled(function: _Function) -> _Function:
     """The function as machine code. Without fast-math: equal arguments give equal bits on one platform."""
-    return cast("_Function", numba.njit(cache=True, error_model="numpy")(function))
+    made: Any = numba.njit(cache=True, error_model="numpy")(function)
+    # Numba recompiles a function when its own file changes. Its machine code contains what it calls, and
+    # constants of other files: these must count too.
+    file, known = made._cache._cache_file, function.__globals__
+    used = [known[name] for name in function.__code__.co_names if name in known]
+    stamps = [x._cache._cache_file._source_stamp for x in used if isinstance(x, type(made))]
+    values = [x for x in used if isinstance(x, int | float | np.number)]
+    file._source_stamp = hashlib.sha256(repr((file._source_stamp, stamps, values)).encode()).digest()
+    return cast("_Function", made)
 
 
 def constant(value: int) -> int:
