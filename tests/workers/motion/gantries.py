@@ -32,7 +32,7 @@ def machine(
     slides: Sequence[bool] = (True, True, True),
     T_hand: F64 = ABOVE,
 ) -> Search:
-    """A small cube that slides along x, y and z, or on other joints, with a cube as hand above it."""
+    """A small cube that slides along x, y and z, or on other joints, with a cube as hand above it: twice as large where it is open."""
     tree = KinematicTree(
         np.arange(3) - 1, np.tile(np.eye(4), (3, 1, 1)), np.eye(3) if axes is None else axes,
         np.array(slides), np.arange(3), np.ones(3), np.zeros(3), np.full(3, -1.0), np.full(3, 1.0),
@@ -46,7 +46,11 @@ def machine(
     )
     still = still_of(list(boxes), list(kinds) or [0] * len(boxes))
     room = in_memory(Room(still, np.arange(len(boxes))))
-    hand = in_memory(Hand(parts_of([[cube]]), parts_of([[cube]])))
+    small, large = parts_of([[cube]]), parts_of([[2 * cube]])
+    pair = {
+        k: np.concatenate([getattr(p, k) for p in (small, large)]) for k in ("points_m", "center_m", "half_m")
+    }
+    hand = in_memory(Hand(small._replace(**pair), small))
     compiled, lines = in_memory(arm), np.empty((5, 5, 3))
     work = workspace(compiled, hand, room, lines, lines.copy(), np.zeros(1, np.int64))
     root = np.ascontiguousarray(np.eye(4)[:3])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.motion.arm_model import arm_of, on_pedestal
 from datagen.workers.motion.arm_motion import NO_HAND, Search, is_blocked
 from datagen.workers.motion.hand_motion import NOTHING, TARGET
 from datagen.workers.motion.plan_candidate import _Search  # pyright: ignore
@@ -54,6 +55,11 @@ def test_the_pedestal_is_an_obstacle_for_all_but_the_first_links() -> None:
     T = np.diag([1.0, -1.0, -1.0, 1.0])  # down, beside the pedestal and below the mount
     T[:3, 3] = (0.4, 0.0, -0.1)
     q = next(q for q in (robot.ik(T, home) for home in robot.homes_rad) if q is not None)
+    plain, on_top = arm_of(robot), on_pedestal(arm_of(robot), robot.base_height_m, 0.2)
+    more = on_top.own_pairs[len(plain.own_pairs) :]
+    assert set(more[:, 1]) == {len(plain.own.owner)}
+    wanted = np.flatnonzero(robot.tree.frame_joint[plain.own.owner] > 0)
+    np.testing.assert_array_equal(more[:, 0], wanted)
     for radius_m, touches in ((0.1, False), (0.4, True)):
         ready = prepared(scene, robot, pedestal_m=radius_m)
         at = search_at(ready, base)

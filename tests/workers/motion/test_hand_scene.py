@@ -77,6 +77,15 @@ def test_neighbours_block_grasps() -> None:
     assert not free_with(((2.0, 2.0, 2.0), (0, 0, 0))).any()  # the whole hand within a block
 
 
+def test_the_hand_keeps_its_distance_at_the_pregrasp() -> None:
+    """A plate behind the hand, 8 cm before its grasps along x: 5 mm, and what the arm may be off."""
+    along_x = box_grasps().T_object_tcp[:, 0, 2] > 0.5
+    back_m = np.concatenate(arm().gripper.palm_parts_m)[:, 2].min() - PARAMS.pregrasp_m
+    for gap_m, is_free in ((0.004, False), (0.006, False), (0.007, True)):
+        plate = free_with(((0.02, 0.3, 0.3), (back_m - gap_m - 0.01, 0, 0)))
+        assert (plate[along_x] == is_free).all()
+
+
 def test_fingers_do_not_fit_around_what_is_wider_than_their_opening() -> None:
     assert not free_with(target_m=(0.09, 0.09, 0.12)).any()
 

@@ -99,6 +99,8 @@ def test_arm_and_hand_are_blocked_by_what_is_not_ignored() -> None:
             assert is_blocked(at, q, 0, NOTHING) == touches
             assert is_blocked(at, q, NO_HAND, NOTHING) == (touches and of_arm)
             assert not is_blocked(at, q, 0, TARGET)
+    near_hand = machine([box_vertices((0.1,) * 3, (0.067, 0.0, 0.1))])
+    assert [is_blocked(near_hand, q, opening, NOTHING) for opening in (0, 1)] == [False, True]
 
 
 def followed(at: Search, rows: int, back_m: float, rise_m: float, ignored: int = NOTHING) -> bool:
@@ -120,8 +122,9 @@ def test_a_line_is_followed_where_the_arm_is_free_and_its_joints_reach() -> None
     fine = LIMITS._replace(step=0.005)
     for k in range(17):  # a speck anywhere on the way of the arm, from the first point to the last
         at = machine([box_vertices((0.04, 0.04, 0.001), (0.0, 0.0, -0.005 * k))], [int(TARGET)], fine)
-        assert not followed(at, 5, 0.08, 0.0)
-        assert followed(at, 5, 0.08, 0.0, TARGET)
+        for rows in (3, 5):
+            assert not followed(at, rows, 0.08, 0.0)
+            assert followed(at, rows, 0.08, 0.0, TARGET)
         if k * 0.005 > CUBE_M / 2 + 0.001:
             assert followed(at, 5, 0.0, 0.08)
 
