@@ -182,6 +182,6 @@ def gap_m(A: F64, T: F64, B: F64, near_m: float, far_m: float, axis: F64, W: F64
         squared = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
         if n == 4 or squared <= near_m * near_m or squared <= _TOUCHING:
             axis[0] = axis[1] = axis[2] = 0.0
-            return math.sqrt(squared)
+            return 0.0 if squared <= _TOUCHING else math.sqrt(squared)
     axis[0], axis[1], axis[2] = v[0], v[1], v[2]
     return math.sqrt(squared)

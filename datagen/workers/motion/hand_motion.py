@@ -14,7 +14,7 @@ from datagen.workers.kinematics.contacts import Parts, Scratch, Still, hits_stil
 from datagen.workers.kinematics.tree import Bools, Ints
 
 # Kinds of still parts, as bits.
-NOTHING, TARGET, FLOOR = constant(0), constant(1), constant(2)
+NOTHING, TARGET, FLOOR, OTHER = constant(0), constant(1), constant(2), constant(4)
 _ALL_BUT_TARGET = ~TARGET
 
 

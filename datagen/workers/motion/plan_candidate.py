@@ -191,9 +191,9 @@ def _near_grasps(search: _Search, rows: list[int]) -> MotionPlan | None:
         if len(T) == 0:
             break
         each = _NEARBY // len(T)
-        opening = np.repeat(opening, each)
-        T, motion = _varied(np.repeat(T, each, axis=0), np.repeat(motion, each, axis=0), search.rng)
-        poses, stages = Poses.unknown(T, opening), dict[int, int]()
+        T, opening = np.repeat(T, each, axis=0), np.repeat(opening, each)
+        near, motion = _varied(T, np.repeat(motion, each, axis=0), search.rng)
+        poses, stages = Poses.unknown(near, opening), dict[int, int]()
         order = search.best_first(in_memory(poses), 0, len(T), np.full(0, -1))
         plan = search.try_poses(poses, order[:_NEARBY_TRIED], False, stages) or search.search_paths()
         if plan is not None:

@@ -21,6 +21,7 @@ from datagen.workers.motion.arm_model import TOUCH_M, arm_of, core_of, hand_of, 
 from datagen.workers.motion.arm_motion import Arm
 from datagen.workers.motion.hand_motion import (
     FLOOR,
+    OTHER,
     TARGET,
     Hand,
     Limits,
@@ -146,7 +147,8 @@ def hand_scene(
     static, floor = _static_around(scene, around_m)
     objects = [_placed(m, T) for m, T in zip(scene.models, scene.T_world_object, strict=True)]
     others = [part for parts in objects[1:] for part in parts]
-    kinds = [int(FLOOR) * f for f in floor] + [int(TARGET)] * len(objects[0]) + [0] * len(others)
+    kinds = [int(FLOOR if f else OTHER) for f in floor]
+    kinds += [int(TARGET)] * len(objects[0]) + [int(OTHER)] * len(others)
     still = still_of([*static, *objects[0], *others], kinds)
     # The hand is never farther from the target than this: the other parts need no check.
     center, room_m = scene.target_center_m, _HAND_ROOM_M + max(limits.pregrasp_m, limits.lift_m)

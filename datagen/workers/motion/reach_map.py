@@ -289,7 +289,8 @@ def _upright(tree: KinematicTree) -> tuple[int, F64]:
         if np.abs(axis[:2]).max() > 1e-6:
             break
         if not tree.slides[j]:
-            # A joint that turns the other way would need the opposite azimuth.
-            is_plain = axis[2] > 0 and tree.ratio[j] == 1.0
-            return (int(tree.coordinate[j]), T[:2, 3].copy()) if is_plain else (-1, np.zeros(2))
+            # A joint that turns the other way would need the opposite azimuth; others must not turn with it.
+            turn = tree.coordinate[j]
+            is_plain = axis[2] > 0 and tree.ratio[j] == 1.0 and np.count_nonzero(tree.coordinate == turn) == 1
+            return (int(turn), T[:2, 3].copy()) if is_plain else (-1, np.zeros(2))
     return -1, np.zeros(2)

@@ -1,4 +1,4 @@
-"""Scenes on the table of `table_house`, grasps of a box written by hand, a check of plans without coal."""
+"""Scenes on the table of `table_house`, and grasps of a box written by hand."""
 
 from __future__ import annotations
 
@@ -7,14 +7,12 @@ from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from datagen.schemas.specification import MotionParams
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.geometry.transforms import inverse
 from datagen.workers.grasps.grasp_cache import GraspSet
 from datagen.workers.houses.house import House, StaticBody
-from datagen.workers.motion import MotionPlan, PlanReport
+from datagen.workers.motion import PlanReport
 from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.rendering import SceneGeometry
@@ -82,8 +80,9 @@ def prepared(
     grasps: GraspSet | None = None,
     params: MotionParams = PARAMS,
     per_scene: int = 40,
+    pedestal_m: float = PEDESTAL_M,
 ) -> PlanningScene:
-    return prepare(scene, robot or arm(), grasps or box_grasps(), params, per_scene, PEDESTAL_M)
+    return prepare(scene, robot or arm(), grasps or box_grasps(), params, per_scene, pedestal_m)
 
 
 def front_base(
@@ -102,57 +101,3 @@ def digest(report: PlanReport) -> str:
         for name in report.plan.__dataclass_fields__:
             content.update(np.asarray(getattr(report.plan, name)).tobytes())
     return content.hexdigest()
-
-
-class HalfSpaces:
-    """Convex parts as half-spaces and points: says whether two sets of parts overlap, by points alone."""
-
-    def __init__(self, parts: Sequence[np.ndarray], rng: np.random.Generator) -> None:
-        self.faces = [ConvexHull(p.astype(np.float64)).equations for p in parts]
-        self.points = [_points(p.astype(np.float64), rng) for p in parts]
-
-    def deepest_m(self, T: F64, other: HalfSpaces, T_other: F64) -> float:
-        """How deep a point of any part lies in a part of the other; both ways, negative where free."""
-        here_there = inverse(T_other) @ T
-        return max(
-            self._depth(other, here_there, self.points), other._depth(self, inverse(here_there), other.points)
-        )
-
-    def _depth(self, other: HalfSpaces, T: F64, points: Sequence[F64]) -> float:
-        moved = np.concatenate([p @ T[:3, :3].T + T[:3, 3] for p in points])
-        return max(float(-(moved @ f[:, :3].T + f[:, 3]).max(axis=1).min()) for f in other.faces)
-
-
-def _points(corners: F64, rng: np.random.Generator) -> F64:
-    """Corners, and points spread over the edges and faces between them."""
-    triangles = ConvexHull(corners).simplices
-    weights = rng.dirichlet(np.ones(3), (len(triangles), 12))  # (F, 12, 3)
-    inner = np.einsum("fws,fsx->fwx", weights, corners[triangles]).reshape(-1, 3)
-    return np.concatenate([corners, inner])
-
-
-def deepest_in_plan_m(scene: SettledScene, robot: Robot, plan: MotionPlan, T_world_base: F64) -> float:
-    """How deep the robot enters the house, the clutter or, on the way to the pregrasp, the target."""
-    rng = np.random.default_rng(0)
-    static = HalfSpaces([p for b in scene.house.house.bodies for p in b.convex_parts_m], rng)
-    objects = [HalfSpaces(m.convex_parts_m, rng) for m in scene.models]
-    hand_names = {n for n in robot.link_names if "hand" in n or "finger" in n}
-    links = [
-        (k, HalfSpaces(parts, rng))
-        for k, (name, parts) in enumerate(zip(robot.link_names, robot.link_parts_m, strict=True))
-        if parts and name not in hand_names
-    ]
-    hand = HalfSpaces(robot.gripper.parts_at(plan.opening_m), rng)
-    deepest = -np.inf
-    phases = ((plan.q_reach_rad, True), (plan.q_approach_rad, False), (plan.q_lift_rad, False))
-    for rows, with_target in phases:
-        for q in rows[:: max(1, len(rows) // 8)]:
-            T_links = T_world_base @ robot.T_base_link(q)
-            bodies = [(shape, T_links[k]) for k, shape in links]
-            T_hand = T_world_base @ robot.T_base_tcp(q)
-            for shape, T in [*bodies, (hand, T_hand)]:
-                deepest = max(deepest, shape.deepest_m(T, static, np.eye(4)))
-                for k, thing in enumerate(objects):
-                    if k > 0 or with_target:
-                        deepest = max(deepest, shape.deepest_m(T, thing, scene.T_world_object[k]))
-    return deepest

@@ -37,7 +37,7 @@ def test_wrong_arguments_name_the_option_and_the_range(
     assert refused.value.place == "--robot" and said in str(refused.value)
 
 
-@pytest.mark.parametrize("module", ["pinocchio", "mani_skill"])
+@pytest.mark.parametrize("module", ["numba", "mani_skill"])
 def test_a_missing_library_is_named_with_the_extra_that_brings_it(module: str) -> None:
     hide = f"import sys; sys.modules['{module}'] = None"
     ask = "from datagen.workers.robots import open_robot, robot_limits; robot_limits('panda')"
