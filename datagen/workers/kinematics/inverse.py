@@ -57,6 +57,13 @@ def put_row(a: F64, out: F64) -> None:
 
 
 @compiled
+def one_turn(lower: float, upper: float) -> tuple[float, float]:
+    """The part of a coordinate's range with every position once: at most a turn, from -pi if possible."""
+    low = min(max(-math.pi, lower), max(lower, upper - 2 * math.pi))
+    return low, min(upper, low + 2 * math.pi)
+
+
+@compiled
 def compose(A: F64, B: F64, out: F64) -> None:
     """out = A B for poses (3, 4)."""
     b00, b01, b02, b03 = B[0, 0], B[0, 1], B[0, 2], B[0, 3]

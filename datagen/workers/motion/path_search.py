@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.kinematics.compiler import compiled
-from datagen.workers.kinematics.inverse import put, put_row
+from datagen.workers.kinematics.inverse import one_turn, put, put_row
 from datagen.workers.kinematics.tree import Ints
 from datagen.workers.motion.arm_motion import Search, between, is_blocked, is_line_free, length, steps_on
 from datagen.workers.motion.hand_motion import NOTHING
@@ -64,7 +62,7 @@ def connect(
     sample, lower, upper = np.empty(count), s.arm.tree.lower, s.arm.tree.upper
     for k in range(iterations):
         for m in range(count):
-            low, high = max(lower[m], -math.pi), min(upper[m], math.pi)
+            low, high = one_turn(lower[m], upper[m])
             sample[m] = low + (high - low) * rng.random()
         new = sizes[k % 2]
         for grown in range(2):

@@ -15,7 +15,7 @@ import numpy as np
 
 from datagen.workers.geometry.mesh import F32, F64, I32
 from datagen.workers.kinematics.compiler import compiled, in_memory, struct
-from datagen.workers.kinematics.inverse import joint_poses, tcp_pose
+from datagen.workers.kinematics.inverse import joint_poses, one_turn, tcp_pose
 from datagen.workers.kinematics.tree import Ints, KinematicTree
 
 _DISTANCES, _HEIGHTS, _SIDES, _ROLLS, _AZIMUTHS = 16, 32, 3, 8, 12
@@ -164,7 +164,7 @@ def seeds(reach: ReachMap, tree: KinematicTree, T: F64, out: F64, w: ReachWork) 
     Each further one is the first that differs from those before by 1 in some coordinate, or where there is
     none the one that differs most.
     """
-    cells, near, gap = w.cells, w.near, w.gap
+    cells, near, gap, lower, upper = w.cells, w.near, w.gap, tree.lower, tree.upper
     azimuth = cells_near(reach, T, cells, w.feature)
     count, n = out.shape[1], 0
     for k in range(7):
@@ -177,8 +177,8 @@ def seeds(reach: ReachMap, tree: KinematicTree, T: F64, out: F64, w: ReachWork) 
                 x = reach.q[row, m]
                 if m == reach.turn:
                     x += azimuth
-                    x -= 2 * math.pi * math.floor(x / (2 * math.pi) + 0.5)
-                near[n, m] = min(max(x, tree.lower[m]), tree.upper[m])
+                    x -= 2 * math.pi * math.floor((x - one_turn(lower[m], upper[m])[0]) / (2 * math.pi))
+                near[n, m] = min(max(x, lower[m]), upper[m])
             gap[n] = np.inf
             n += 1
     found, best = min(n, len(out)), 0
@@ -250,8 +250,8 @@ def _in_units(tree: KinematicTree, length_m: float, unit: F64) -> KinematicTree:
     return tree._replace(
         T_parent_joint=_rounded(T),
         offset=_rounded(np.where(tree.slides, tree.offset / length_m, tree.offset)),
-        lower=_rounded(np.maximum(tree.lower, -np.pi) / unit),
-        upper=_rounded(np.minimum(tree.upper, np.pi) / unit),
+        lower=_rounded(tree.lower / unit),
+        upper=_rounded(tree.upper / unit),
         frame_joint=tree.frame_joint[-1:],
         T_joint_frame=_rounded(T_wrist),
     )
@@ -260,7 +260,8 @@ def _in_units(tree: KinematicTree, length_m: float, unit: F64) -> KinematicTree:
 def _samples(one: KinematicTree, turn: int, axis_xy: F64, draw: int) -> tuple[I32, F32, float]:
     """First rows of the cells (C + 1,), joint vectors (N, A), half the map's width, in the tree's units."""
     rng = np.random.Generator(np.random.PCG64(draw))
-    q = rng.uniform(one.lower, one.upper, (_SAMPLES, len(one.lower)))
+    low, high = np.transpose([one_turn(*limits) for limits in zip(one.lower, one.upper, strict=True)])
+    q = rng.uniform(low, high, (_SAMPLES, len(low)))
     cell, features = np.empty(len(q), np.int64), np.empty((len(q), 8))
     reach = ReachMap(np.zeros(1, np.int32), q[:0].astype(np.float32), axis_xy, turn, np.zeros(3), 1.0)
     tree, some = in_memory(one), q[:_FIRST_SAMPLES].copy()

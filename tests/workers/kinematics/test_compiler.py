@@ -1,26 +1,48 @@
-"""Machine code kept on disk follows the sources that it was made of."""
+"""Machine code kept on disk: of these very sources, whole, or made again."""
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
-HEAD = "from datagen.workers.kinematics.compiler import compiled, constant\n"
-INNER = f"{HEAD}TWO = constant(2)\n@compiled\ndef inner(x):\n    return x + 1\n"
-OUTER = f"{HEAD}from inner_code import TWO, inner\n@compiled\ndef outer(x):\n    return TWO * inner(x)\n"
-ASK = "from outer_code import outer; print(outer(1), len(outer.stats.cache_hits))"
+import datagen
+
+ASK = """
+import numpy as np
+from datagen.workers.motion.path_search import dense
+print(len(dense(np.ones(2), np.array([[0.0, 0.0], [0.0, 1.0]]), 2.0)), sum(dense.stats.cache_hits.values()))
+"""
 
 
-def test_a_function_is_compiled_again_when_what_it_uses_changes(tmp_path: Path) -> None:
+def test_code_is_loaded_and_made_again_where_sources_changed_or_it_is_damaged(tmp_path: Path) -> None:
+    package, cache = tmp_path / "datagen", tmp_path / "cache"
+    shutil.copytree(Path(datagen.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    environment = os.environ | {"PYTHONPATH": str(tmp_path), "DATAGEN_CACHE": str(cache)}
+
     def asked() -> list[int]:
-        code = f"import sys; sys.path.append({str(tmp_path)!r}); {ASK}"
-        told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        return [int(x) for x in told.stdout.split()]
+        told = subprocess.run(
+            [sys.executable, "-c", ASK],
+            check=False,
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+        )
+        assert told.returncode == 0, told.stderr
+        return [int(word) for word in told.stdout.split()]
 
-    (tmp_path / "outer_code.py").write_text(OUTER)
-    (tmp_path / "inner_code.py").write_text(INNER)
-    assert asked() == [4, 0]
-    assert asked() == [4, 1]
-    (tmp_path / "inner_code.py").write_text(INNER.replace("x + 1", "x + 9").replace("(2)", "(3)"))
-    assert asked() == [30, 0]
+    assert asked() == [2, 0]
+    assert asked() == [2, 1]
+    for path in (cache / "machine-code").rglob("*.code"):
+        path.write_bytes(path.read_bytes()[:-9])
+    assert asked() == [2, 0]
+    # `dense` calls a function of another file.
+    callee = package / "workers" / "motion" / "arm_motion.py"
+    callee.write_text(callee.read_text().replace("return max(1, math", "return max(2, math"))
+    assert asked() == [3, 0]
+    shutil.rmtree(cache)
+    cache.write_text("a file where the folder should be")
+    assert asked() == [3, 0]

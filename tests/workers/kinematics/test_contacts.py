@@ -181,10 +181,10 @@ def test_margins_move_the_border_on_every_side() -> None:
     cube = ((np.arange(8)[:, None] >> np.arange(3)) & 1) * 0.2 - 0.1
     one, wall, scratch = in_memory(parts_of([[cube]])), in_memory(still_of([5 * cube], [0])), scratch_of(1, 1)
     for way in np.vstack([np.eye(3), -np.eye(3)]):
-        for gap_m, margin_m in product((-0.003, 0.003, 0.007), (0.0, 0.005)):
-            T = np.column_stack([np.eye(3), way * (0.6 + gap_m)])[None].copy()
+        for apart_m, margin_m in product((-0.003, 0.003, 0.007), (0.0, 0.005)):
+            T = np.column_stack([np.eye(3), way * (0.6 + apart_m)])[None].copy()
             hit = hits_still(one, 0, T, wall, np.arange(1), 0, margin_m, scratch)
-            assert hit == (gap_m < margin_m)
+            assert hit == (apart_m < margin_m)
 
 
 def test_parts_of_nothing_touch_nothing() -> None:

@@ -11,7 +11,7 @@ from datagen.workers.geometry.transforms import translation
 from datagen.workers.kinematics.compiler import in_memory
 from datagen.workers.kinematics.contacts import parts_of
 from datagen.workers.kinematics.tree import KinematicTree
-from datagen.workers.motion.arm_motion import Arm, Search, workspace
+from datagen.workers.motion.arm_motion import Arm, Search, search_at
 from datagen.workers.motion.hand_motion import Hand, Limits, Room
 from datagen.workers.motion.planning_scene import limits_of, still_of
 from datagen.workers.motion.reach_map import ReachMap
@@ -32,7 +32,7 @@ def machine(
     slides: Sequence[bool] = (True, True, True),
     T_hand: F64 = ABOVE,
 ) -> Search:
-    """A small cube that slides along x, y and z, or on other joints, with a cube as hand above it: twice as large where it is open."""
+    """A small cube on joints that slide or turn; its hand is a cube above it, larger when open."""
     tree = KinematicTree(
         np.arange(3) - 1, np.tile(np.eye(4), (3, 1, 1)), np.eye(3) if axes is None else axes,
         np.array(slides), np.arange(3), np.ones(3), np.zeros(3), np.full(3, -1.0), np.full(3, 1.0),
@@ -51,9 +51,16 @@ def machine(
         k: np.concatenate([getattr(p, k) for p in (small, large)]) for k in ("points_m", "center_m", "half_m")
     }
     hand = in_memory(Hand(small._replace(**pair), small))
-    compiled, lines = in_memory(arm), np.empty((5, 5, 3))
-    work = workspace(compiled, hand, room, lines, lines.copy(), np.zeros(1, np.int64))
-    root = np.ascontiguousarray(np.eye(4)[:3])
-    return in_memory(
-        Search(compiled, hand, room, in_memory(limits), root, np.arange(len(boxes)), False, work)
+    lines, root = np.empty((5, 5, 3)), np.ascontiguousarray(np.eye(4)[:3])
+    within = np.arange(len(boxes))
+    return search_at(
+        in_memory(arm),
+        hand,
+        room,
+        in_memory(limits),
+        root,
+        within,
+        lines,
+        lines.copy(),
+        np.zeros(1, np.int64),
     )

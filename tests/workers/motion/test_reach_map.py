@@ -10,9 +10,16 @@ from hypothesis import strategies as st
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.kinematics.compiler import in_memory
-from datagen.workers.motion import arm_model
-from datagen.workers.motion.arm_model import arm_of, reach_map
-from datagen.workers.motion.reach_map import ReachMap, cells_near, reach_workspace, score, seeds
+from datagen.workers.motion import reach_map as reach_maps
+from datagen.workers.motion.arm_model import arm_of
+from datagen.workers.motion.reach_map import (
+    ReachMap,
+    cells_near,
+    reach_map,
+    reach_workspace,
+    score,
+    seeds,
+)
 from datagen.workers.robots.robot import Robot
 from tests.workers.kinematics.trees import random_tree
 from tests.workers.motion.tables import arm
@@ -39,7 +46,8 @@ def score_at(reach: ReachMap, T: F64) -> int:
 def test_reachable_poses_have_samples_whose_seeds_lead_there(robot: Robot) -> None:
     reach, rng, solved = arm_of(robot).reach, np.random.default_rng(1), list[bool]()
     tree, apart, gaps_m = in_memory(arm_of(robot).tree), list[float](), list[float]()
-    low, high = np.maximum(robot.q_lower_rad, -np.pi), np.minimum(robot.q_upper_rad, np.pi)
+    low, high = robot.q_lower_rad, robot.q_upper_rad
+    low, high = np.maximum(low, np.minimum(-np.pi, high - 2 * np.pi)), np.minimum(high, low + 2 * np.pi)
     for _ in range(60):
         T = robot.T_base_tcp(rng.uniform(low, high))
         found = seeds_at(reach, tree, T, 4, len(robot.joint_names))
@@ -62,8 +70,8 @@ def test_reachable_poses_have_samples_whose_seeds_lead_there(robot: Robot) -> No
 @given(seed=st.integers(0, 2**32 - 1))
 def test_samples_lie_in_the_cells_of_their_poses(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
     """However the whole arm is turned about an upright first joint: the seed is turned as much."""
-    monkeypatch.setattr(arm_model, "_SAMPLES", 1 << 10)
-    monkeypatch.setattr(arm_model, "_FIRST_SAMPLES", 1 << 9)
+    monkeypatch.setattr(reach_maps, "_SAMPLES", 1 << 10)
+    monkeypatch.setattr(reach_maps, "_FIRST_SAMPLES", 1 << 9)
     rng = np.random.default_rng(seed)
     tree = random_tree(rng)
     if tree.frame_joint[-1] < 0 or len(tree.lower) < 3:
