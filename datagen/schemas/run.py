@@ -52,6 +52,7 @@ from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage, open_storage
 
 MOST_SAMPLES = 10**12  # of a run
+_MOST_REMEMBERED = 10_000  # commits, of 3 kB each
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
 
 
@@ -234,7 +235,8 @@ class Run:
 
     def remember(self, commit: Commit) -> None:
         """Remember a commit that this process has the words of, so that `brief_commits` does not read it."""
-        self._remembered[commit.shard] = _in_brief(commit)
+        if len(self._remembered) < _MOST_REMEMBERED:
+            self._remembered[commit.shard] = _in_brief(commit)
 
     def brief_commits(self) -> Iterator[Commit]:
         """As `commits`, without cost and machine: most of their memory."""

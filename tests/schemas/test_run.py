@@ -76,6 +76,26 @@ def test_of_racing_committers_one_wins_and_the_run_holds_its_attempt(tmp_path: P
     assert sum(won) == 1 and Run.open(tmp_path).commit_of(0).attempt == f"attempt-{won.index(True)}"
 
 
+def test_brief_commits_are_all_in_order_with_and_without_those_remembered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(tmp_path, 50, shards=[4, 0, 2, 1])
+    expected = list(run.brief_commits())
+    assert [commit.shard for commit in expected] == [0, 1, 2, 4] and not any(c.redraws for c in expected)
+    monkeypatch.setattr("datagen.schemas.run._MOST_REMEMBERED", 2)
+    for commit in [*run.commits()][1:]:
+        run.remember(commit)
+    assert list(run.brief_commits()) == expected
+    for shard in (1, 2):  # the first two are not read again
+        (tmp_path / f"commits/{shard:06d}.json").write_bytes(b"")
+    assert list(run.brief_commits()) == expected
+    run.storage.delete(["commits/000001.json"])  # by a repair
+    assert [commit.shard for commit in run.brief_commits()] == [0, 2, 4]
+    (tmp_path / "commits/000004.json").write_bytes(b"")  # the third
+    with pytest.raises(InputError, match=r"000004\.json"):
+        list(run.brief_commits())
+
+
 def test_quarantine_takes_a_shard_from_the_missing_until_it_is_committed(tmp_path: Path) -> None:
     run = make_run(tmp_path, n=30, shards=[0])
     record = QuarantineRecord(
