@@ -96,7 +96,7 @@ def run(
         work = JobRun(made, absolute(options.houses), absolute(options.objects))
         job = LabelJob(made.storage, out, [work], JobOptions(workers=workers), time.monotonic())
         started_s = time.perf_counter()
-        summary = job.make_missing(job.record())
+        summary = job.make_missing(job.record(missing := job.missing()), missing)
         ended_s = time.perf_counter()
         if summary.end != "complete":
             raise InputError(out, "", f"the job ended {summary.end}: {summary.cause}", "Fix that first")

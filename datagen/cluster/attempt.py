@@ -32,7 +32,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
     run, world, scenes_run = open_task(task)
     with ends_job():
         run.ledger.start(task.attempt, task.shard)
-        if run.storage.exists(commit_key(task.shard)):  # by another driver, while this attempt was queued
+        if task.may_be_done and run.storage.exists(commit_key(task.shard)):
             return AttemptResult(False, 0, 0, meter.cost())
     stored = None if scenes_run is None else list(read_scenes(scenes_run, task.scene_indices))
     made = run_shard(task.spec, world, task.scene_indices, stored, meter.watch)
@@ -58,7 +58,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
     )
     with ends_job():
         won = run.commit(commit)
-    return AttemptResult(won, len(labels), positives, cost)
+    return AttemptResult(won, len(labels), positives, cost, commit if won else None)
 
 
 def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:

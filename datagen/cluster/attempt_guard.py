@@ -95,6 +95,7 @@ def guarded(function: Callable[[T, Meter], AttemptResult], task: T, deadline: bo
         labels=product.labels,
         positives=product.positives,
         cost=product.cost,
+        commit=product.commit,
     )
 
 

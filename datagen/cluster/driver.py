@@ -50,12 +50,13 @@ class AttemptOrder:
     shard: int
     attempt: str
     deadline_s: float
+    may_be_done: bool = True  # another attempt may have committed the shard
 
 
 class Recorder(Protocol):
     """Records of the ends of attempts and shards. `missing` are neither committed nor quarantined now."""
 
-    def close(self, entry: LedgerEntry) -> None: ...
+    def close(self, entry: LedgerEntry, commit: Commit | None) -> None: ...
     def quarantine(self, shard: int, trouble: ShardFailures) -> None: ...
     def commit_of(self, shard: int) -> Commit | None: ...
     def missing(self) -> ShardRanges: ...
@@ -189,6 +190,7 @@ class _Driver(Generic[T]):
             shard=shard,
             attempt=f"{shard:06d}-{self._name}-{self._numbered:06d}",
             deadline_s=deadline_s(self._policy, self._durations, trouble),
+            may_be_done=bool(trouble.attempts or self._totals.superseded),
         )
         now_s = self._clock()
         check_s = now_s + order.deadline_s + self._policy.grace_s
@@ -225,7 +227,7 @@ class _Driver(Generic[T]):
         # The former have no worker's report, and an unfit machine is not used again.
         if report.outcome not in ("cancelled", "hung") and not report.is_unfit:
             self._lost_in_a_row = self._lost_in_a_row + 1 if report.outcome == "lost" else 0
-        self._recorder.close(LedgerEntry.model_validate(report, from_attributes=True))
+        self._recorder.close(LedgerEntry.model_validate(report, from_attributes=True), report.commit)
         self._totals.count(report)
         if report.outcome == "committed" and report.cost is not None:
             self._durations.add(report.cost.wall_s)

@@ -98,7 +98,7 @@ class JobProgress:
 class JobMonitor(JobProgress):
     """A driver's events, shown and published every `BEAT_S`; looks for requests to stop every `LOOK_S`.
 
-    `check` raises InputError where the job must end; it is called as often.
+    `check` raises InputError where the job must end; it is called before each state.
     """
 
     def __init__(
@@ -125,11 +125,11 @@ class JobMonitor(JobProgress):
         now_s = self._clock()
         if now_s >= self._next_look_s:
             self._next_look_s = now_s + LOOK_S
-            with suppress(StoreUnavailable):
-                self._check()
             self._recorder.pass_on_request(self._stop)
         if now_s >= self._next_beat_s:
             self._next_beat_s = now_s + BEAT_S
+            with suppress(StoreUnavailable):
+                self._check()
             self._recorder.publish(totals, self._pace.per_s(), self.left_s(totals), self._reason)
 
 

@@ -13,7 +13,7 @@ from types import FrameType
 from typing import Literal, Protocol, TypeVar, get_args
 
 from datagen.cluster.code_digest import code_digest
-from datagen.schemas.run_records import Cost, Host, Layout, Outcome
+from datagen.schemas.run_records import Commit, Cost, Host, Layout, Outcome
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage.errors import StoreUnavailable, repeated_until
 
@@ -56,6 +56,7 @@ class ShardTask:
     robot: str = ""  # place of the robot's file; "" for one of the registry
     notes: str = ""
     scenes_from: str = ""  # folder or URL of the run whose scenes are labelled again; "" for new scenes
+    may_be_done: bool = True  # another attempt may have committed the shard
     probe: str = ""  # a file of the run by which machines recognize it; "" for none
     code_digest: str = field(default_factory=code_digest)  # of the driver's code
 
@@ -73,6 +74,7 @@ class AttemptResult:
     labels: int
     positives: int
     cost: Cost
+    commit: Commit | None = None  # this attempt's own
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,7 @@ class AttemptReport:
     positives: int = 0
     cost: Cost | None = None
     host: Host | None = None
+    commit: Commit | None = None
     # The job cannot continue: every attempt would fail (full disk, sources missing).
     ends_job: bool = False
     # It cannot be made on its machine. Executors with other machines continue on these.

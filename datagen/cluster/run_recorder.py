@@ -15,8 +15,10 @@ class RunRecorder:
     def __init__(self, run: Run) -> None:
         self._run = run
 
-    def close(self, entry: LedgerEntry) -> None:
+    def close(self, entry: LedgerEntry, commit: Commit | None = None) -> None:
         """Record how an attempt ended, unless its commit does. An earlier record is kept if not a guess."""
+        if commit is not None:
+            self._run.remember(commit)
         if entry.outcome != "committed":
             self._run.ledger.end(entry)
 

@@ -42,6 +42,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobEnd, Jobs
 from datagen.schemas.run import Run, RunReplaced
 from datagen.schemas.sealing import seal
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage
 from datagen.schemas.storage.errors import JOBS_WAIT_S, repeated_for_minutes, repeated_until
 from datagen.workers.extras import refuse_missing
@@ -130,13 +131,14 @@ class Job:
         return result
 
     def _run(self) -> JobResult:
-        if not self._count_missing():
+        missing = self.missing()
+        if not any(missing):
             for job_run in self.runs:
                 close_lost_attempts(job_run.run)
             return self._finish(self._judged(empty_summary()))
-        recorder = self.record()
+        recorder = self.record(missing)
         try:
-            summary = self._judged(self.make_missing(recorder))
+            summary = self._judged(self.make_missing(recorder, missing))
             recorder.seal()
             result = self._finish(summary)
         except BaseException as error:
@@ -151,15 +153,18 @@ class Job:
         recorder.end(summary.end, result.exit_code, summary.cause, summary)
         return result
 
-    def record(self) -> JobRecorder:
-        """Publish the job's record."""
-        command = ("datagen", *self.command)
-        return JobRecorder(Jobs(self.storage), command, self.options.address, self._count_missing())
+    def missing(self) -> list[ShardRanges]:
+        """The shards of each run that are to be made."""
+        return [job_run.run.missing() for job_run in self.runs]
 
-    def make_missing(self, recorder: JobRecorder) -> JobSummary:
+    def record(self, missing: Sequence[ShardRanges]) -> JobRecorder:
+        """Publish the job's record."""
+        command, shards = ("datagen", *self.command), sum(map(len, missing))
+        return JobRecorder(Jobs(self.storage), command, self.options.address, shards)
+
+    def make_missing(self, recorder: JobRecorder, missing: Sequence[ShardRanges]) -> JobSummary:
         """Drive one run after the other on one set of workers; return the summary."""
-        missing, stop = [job_run.run.missing() for job_run in self.runs], StopRequest()
-        whole = empty_summary()
+        stop, whole = StopRequest(), empty_summary()
         with ExitStack() as stack:
             notes = stack.enter_context(notes_of_a_job())
             shown = stack.enter_context(self.options.display())
@@ -201,6 +206,7 @@ class Job:
                 objects=job_run.objects,
                 robot=job_run.robot,
                 deadline_s=order.deadline_s,
+                may_be_done=order.may_be_done,
                 notes=notes,
                 scenes_from=job_run.scenes_from,
                 probe=probe,
@@ -232,9 +238,6 @@ class Job:
         )
         return stack.enter_context(ray_executor(run_attempt, settings))
 
-    def _count_missing(self) -> int:
-        return sum(len(job_run.run.missing()) for job_run in self.runs)
-
     def _judged(self, summary: JobSummary) -> JobSummary:
         """Decide whether a finished job failed, by the quarantined share of the whole run.
 
@@ -244,18 +247,19 @@ class Job:
             job_run.run.refuse_replaced()
         if summary.end not in ("complete", "failed") or summary.remaining:
             return summary
-        quarantined = planned = 0
-        for job_run in self.runs:
-            shards = job_run.run.planned()
-            planned += len(shards)
-            quarantined += sum(shard in shards for shard in job_run.run.quarantined())
-        failed = too_many_quarantined(self.policy, quarantined, planned)
+        quarantined = [job_run.run.quarantined() for job_run in self.runs]
+        failed = False
+        if any(quarantined):
+            planned = [job_run.run.planned() for job_run in self.runs]
+            ours = sum(shard in of for of, found in zip(planned, quarantined, strict=True) for shard in found)
+            failed = too_many_quarantined(self.policy, ours, sum(map(len, planned)))
         return replace(summary, end="failed" if failed else "complete")
 
     def _finish(self, summary: JobSummary) -> JobResult:
         """Seal the run, unless the job was stopped, and return the result."""
         totals, runs = summary.totals, [job_run.run for job_run in self.runs]
-        causes = Counter(r.causes[-1] for run in runs for r in run.quarantine_records() if r.causes)
+        quarantined = [record for run in runs for record in run.quarantine_records()]
+        causes = Counter(record.causes[-1] for record in quarantined if record.causes)
         if summary.end == "aborted":
             fix = f"Then resume: {command_line(self.resume)}"
             raise _CannotContinue(self.path, "", f"the job cannot continue: {summary.cause}", fix)
@@ -268,7 +272,7 @@ class Job:
             positives=totals.positives,
             shards=totals.shards,
             remaining=summary.remaining,
-            quarantined=tuple(shard for run in runs for shard in sorted(run.quarantined())),
+            quarantined=tuple(record.shard for record in quarantined),
             retries=totals.retries,
             start_s=summary.start_s,
             elapsed_s=summary.elapsed_s,
@@ -280,7 +284,7 @@ class Job:
     def _seal(self, runs: Sequence[Run]) -> str:
         shards = sum(len(run.committed()) for run in runs)
         with self.options.display() as shown:
-            return seal(self.storage, shown.counter("shards sealed")) if shards else ""
+            return seal(self.storage, shown.counter("shards sealed"), runs) if shards else ""
 
 
 def _tell(shown: Progress, event: str, line: str) -> None:

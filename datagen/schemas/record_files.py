@@ -126,8 +126,8 @@ def publish(storage: Storage, key: str, record: bytes) -> None:
 
     The copy decides races, so that both are equal; after a kill in between, the next call completes it.
     """
-    storage.put_new(copy_key(key), record)
-    kept = storage.get(copy_key(key), MAX_RECORD_BYTES)
+    is_first = storage.put_new(copy_key(key), record)
+    kept = None if is_first else storage.get(copy_key(key), MAX_RECORD_BYTES)
     storage.put_new(key, record if kept is None else kept)
 
 

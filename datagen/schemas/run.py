@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from hashlib import sha256
+from heapq import merge
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,7 +37,9 @@ from datagen.schemas.record_files import (
 from datagen.schemas.run_records import (
     MAX_FILE_BYTES,
     Commit,
+    Cost,
     FileEntry,
+    Host,
     Layout,
     Manifest,
     Merged,
@@ -49,6 +52,7 @@ from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage, open_storage
 
 MOST_SAMPLES = 10**12  # of a run
+_MOST_REMEMBERED = 10_000  # commits, of 3 kB each
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
 
 
@@ -76,6 +80,8 @@ class Run:
         self.manifest = manifest
         self.scenes = scenes
         self.ledger = Ledger(storage, self.refuse_replaced)
+        self._plan: Plan | None = None
+        self._remembered: dict[int, Commit] = {}
 
     def __repr__(self) -> str:
         return f"Run({self.storage.url!r})"
@@ -163,11 +169,14 @@ class Run:
         numbers = self.numbers("plans", width=1)
         if not numbers:
             return None
+        if self._plan is not None and self._plan.number == max(numbers):  # plans do not change
+            return self._plan
         plan = read_record(self.storage, key := f"plans/{max(numbers)}.json", Plan)
         if plan is None:  # removed since the listing
             return self.plan()
         if found := other_value(plan, spec_hash=self.manifest.spec_hash, number=max(numbers)):
             raise InputError(f"{self.storage.url}/{key}", *found, REPAIR)
+        self._plan = plan
         return plan
 
     # Shards and commits.
@@ -224,6 +233,18 @@ class Run:
                     raise InputError(place, *found, "Remove this foreign commit")
                 yield commit
 
+    def remember(self, commit: Commit) -> None:
+        """Remember a commit that this process has the words of, so that `brief_commits` does not read it."""
+        if len(self._remembered) < _MOST_REMEMBERED:
+            self._remembered[commit.shard] = _in_brief(commit)
+
+    def brief_commits(self) -> Iterator[Commit]:
+        """As `commits`, without cost and machine: most of their memory."""
+        shards = self.committed()
+        read = self.commits(sorted(shards - self._remembered.keys()))
+        known = (self._remembered[shard] for shard in sorted(shards & self._remembered.keys()))
+        return merge(map(_in_brief, read), known, key=lambda commit: commit.shard)
+
     def write_object(self, attempt: str, data: bytes) -> FileEntry:
         """Write an attempt's rows durably, and return the entry for its commit."""
         if len(data) > MAX_FILE_BYTES:
@@ -257,7 +278,7 @@ class Run:
     def close_lost_attempts(self, ended: str = "") -> int:
         """End attempts without an end, as lost, whose shard is decided without them; return their number."""
         self.refuse_replaced()
-        committed = {commit.attempt: commit.shard for commit in self.commits()}
+        committed = {commit.attempt: commit.shard for commit in self.brief_commits()}
         decided = set(committed.values()) | self.quarantined()
         lost = [start for start in self.ledger.unfinished(committed) if start.shard in decided]
         for start in lost:
@@ -275,7 +296,8 @@ class Run:
 
     def quarantined(self) -> set[int]:
         """Quarantined shards, by listing. A shard that was committed later counts as committed."""
-        return self.numbers("quarantine") - self.committed()
+        found = self.numbers("quarantine")
+        return found - self.committed() if found else found
 
     def quarantine_records(self) -> list[QuarantineRecord]:
         keys = [f"quarantine/{shard:06d}.json" for shard in sorted(self.quarantined())]
@@ -287,6 +309,14 @@ class Run:
         numbered = ((name, int(found[1])) for name in names if (found := _NUMBERED.fullmatch(name)))
         # Only names in the form that is written: no drafts, and not "7.json" for "000007.json".
         return {number for name, number in numbered if name == f"{number:0{width}d}.json"}
+
+
+_NO_HOST = Host(name="", cpu="", cores=0, memory_bytes=0)
+_LEFT_OUT = {"cost": Cost(wall_s=0, cpu_s=0), "host": _NO_HOST, "redraws": {}}
+
+
+def _in_brief(commit: Commit) -> Commit:
+    return commit.model_copy(update=_LEFT_OUT)
 
 
 def open_runs(path: Storage | Path | str) -> list[Run]:

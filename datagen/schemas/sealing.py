@@ -25,7 +25,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import TABLES, Field, RecordSchema, Table
 from datagen.schemas.record_files import encode_record, read_record
 from datagen.schemas.run import Rows, Run, open_runs
-from datagen.schemas.run_records import Commit, Cost, FileEntry, Host, Layout, SealedPart, StoreRecord
+from datagen.schemas.run_records import Commit, FileEntry, Layout, SealedPart, StoreRecord
 from datagen.schemas.shard_files import (
     cf_attributes,
     described,
@@ -117,7 +117,7 @@ def read_contents(runs: Sequence[Run]) -> Contents:
     held: list[tuple[Run, int, tuple[Commit, ...]]] = []
     for run in runs:
         planned = run.planned(n := run.n)
-        held.append((run, n, tuple(map(_in_brief, (c for c in run.commits() if c.shard in planned)))))
+        held.append((run, n, tuple(c for c in run.brief_commits() if c.shard in planned)))
     last = max((k for k, (_, _, commits) in enumerate(held) if commits), default=None)
     if last is None:
         place = first.storage.url
@@ -127,15 +127,6 @@ def read_contents(runs: Sequence[Run]) -> Contents:
     return Contents(sealed, first.schema, layout)
 
 
-_NO_HOST = Host(name="", cpu="", cores=0, memory_bytes=0)
-_LEFT_OUT = {"cost": Cost(wall_s=0, cpu_s=0), "host": _NO_HOST, "redraws": {}}
-
-
-def _in_brief(commit: Commit) -> Commit:
-    """The commit without cost and machine, most of its memory: those of all shards are held."""
-    return commit.model_copy(update=_LEFT_OUT)
-
-
 _ROOT = "zarr.json"
 _NUMBERED = re.compile(r"data(?:-([0-9]+))?\.zarr")
 CLAIM = ".claim"  # beside a store: who made it first writes the store
@@ -143,14 +134,16 @@ _NO_CHUNK = 2**64 - 1  # offset and size of a chunk beyond the array's end
 Tick = Callable[[int, int], None]
 
 
-def seal(storage: Storage, tick: Tick = lambda done, total: None) -> str:
+def seal(storage: Storage, tick: Tick = lambda done, total: None, runs: Sequence[Run] | None = None) -> str:
     """Write the store over the committed shards of the run, or merged runs, in `storage`; return its address.
+
+    `runs` are those of `open_runs`, where they are open.
 
     Quarantined and missing shards are omitted. Nothing is written where the store is up to date. `tick` is
     called with the number of shards written, and of all. InputError when no shard is committed, a shard is
     missing or damaged, merged runs have different arrays, or the disk or the server fails.
     """
-    contents = read_contents(open_runs(storage))
+    contents = read_contents(runs or open_runs(storage))
     old = store_record(storage)
     digest, parts = contents.digest(), contents.parts()
     if old is not None and (old.rows_sha256, old.parts) == (digest, parts):

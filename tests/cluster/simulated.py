@@ -135,7 +135,7 @@ class PaperRecorder:
     commits: dict[int, Commit] = field(default_factory=dict)
     closed: Counter[str] = field(default_factory=Counter)
 
-    def close(self, entry: LedgerEntry) -> None:
+    def close(self, entry: LedgerEntry, commit: Commit | None = None) -> None:
         self.closed[entry.outcome] += 1
         if self.keep_entries:
             self.entries.append(entry)

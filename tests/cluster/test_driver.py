@@ -12,7 +12,7 @@ from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.protocol import JobSummary, JobTotals, StopRequest
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.errors import InputError
-from datagen.schemas.run_records import LedgerEntry
+from datagen.schemas.run_records import Commit, LedgerEntry
 from tests.cluster.bad_cluster import simulate
 from tests.cluster.simulated import (
     LENIENT,
@@ -170,7 +170,7 @@ def test_the_window_bounds_what_is_in_flight() -> None:
 
 def test_a_ledger_that_cannot_be_written_ends_attempts_in_flight() -> None:
     class FullLedger(PaperRecorder):
-        def close(self, entry: LedgerEntry) -> None:
+        def close(self, entry: LedgerEntry, commit: Commit | None = None) -> None:
             raise InputError("RUN/ledger", "", "No space left on device", "Free disk space")
 
     clock = FakeClock()
@@ -178,6 +178,22 @@ def test_a_ledger_that_cannot_be_written_ends_attempts_in_flight() -> None:
     with pytest.raises(InputError, match="No space left"):
         drive(range(50), lambda o: o, executor, FullLedger(), RetryPolicy(), Heard(), StopRequest(), clock)
     assert executor.in_flight == 0
+
+
+def test_a_worker_looks_for_a_commit_once_another_attempt_may_have_made_one() -> None:
+    for outcome, of_all in (("failed", False), ("superseded", True)):
+        clock, recorder, made = FakeClock(), PaperRecorder(), list[AttemptOrder]()
+        script = {(1, 1): outcome}
+        executor = SimulatedExecutor(clock, lambda o, n, s=script: (s.get((o.shard, n), "committed"), 1.0))
+
+        def make(order: AttemptOrder, made: list[AttemptOrder] = made) -> AttemptOrder:
+            made.append(order)
+            return order
+
+        drive(range(40), make, executor, recorder, LENIENT, Heard(), StopRequest(), clock)
+        again = made[[order.shard for order in made].index(1) + 1 :]
+        assert not made[0].may_be_done and made[-1].may_be_done == of_all
+        assert all(order.may_be_done for order in again if order.shard == 1)
 
 
 WORDS = st.sampled_from(["crashed", "hung", "failed", "out_of_memory", "lost", "silent", "superseded"])

@@ -18,6 +18,7 @@ from datagen.schemas.storage import open_storage
 from tests.conftest import REPOSITORY
 from tests.datagen.test_resume import interrupting
 from tests.made_runs import give_up
+from tests.s3_servers import Faults, environment, faulty_proxy
 from tests.small_runs import HERE, PER_SCENE, json_of, make_small_run, submit_arguments
 
 N = 3 * PER_SCENE
@@ -55,6 +56,27 @@ def test_a_run_on_s3_is_resumed_extended_and_told_of(
     assert "tried again later" in capsys.readouterr().out
     here = make_small_run(tmp_path / "run", N + PER_SCENE)
     assert digests_of(Run.open(run)) == digests_of(Run.open(here))
+
+
+def test_a_shard_costs_six_requests(
+    bucket: str, s3_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Five by its worker, of them two looks at the manifest, and its object by the seal."""
+    seen = list[str]()
+
+    class Seen(Faults):
+        def kind(self, path: str, creates: bool) -> str:
+            seen.append(path)
+            return "pass"
+
+    with faulty_proxy(s3_port, Seen()) as port:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", environment(port)["AWS_ENDPOINT_URL"])
+        assert cli.run(arguments(f"{bucket}/run", 12 * PER_SCENE, tmp_path)) == 0
+        paths = list(seen)
+        shards = len(Run.open(f"{bucket}/run").committed())
+    for folder, each in (("ledger", 1), ("shards", 2), ("commits", 1)):
+        assert sum(f"/run/{folder}/" in path for path in paths) == each * shards, folder
+    assert 0 <= sum(path.endswith("/run/manifest.json") for path in paths) - 2 * shards < 12
 
 
 def digests_of(run: Run) -> dict[str, str]:

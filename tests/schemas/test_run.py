@@ -17,10 +17,10 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMA_VERSION
 from datagen.schemas.record_files import copy_key, publish
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import FileEntry, Layout, LedgerEntry, QuarantineRecord, StageClock
+from datagen.schemas.run_records import Layout, LedgerEntry, QuarantineRecord, StageClock
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import open_storage
-from tests.made_runs import commit_of, files_of, make_run, manifest_of, small_spec, write
+from tests.made_runs import files_of, make_run, manifest_of, small_spec, write
 from tests.schemas.checked import edit
 
 pytestmark = pytest.mark.usefixtures("few_arrays")
@@ -76,6 +76,26 @@ def test_of_racing_committers_one_wins_and_the_run_holds_its_attempt(tmp_path: P
     assert sum(won) == 1 and Run.open(tmp_path).commit_of(0).attempt == f"attempt-{won.index(True)}"
 
 
+def test_brief_commits_are_all_in_order_with_and_without_those_remembered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(tmp_path, 50, shards=[4, 0, 2, 1])
+    expected = list(run.brief_commits())
+    assert [commit.shard for commit in expected] == [0, 1, 2, 4] and not any(c.redraws for c in expected)
+    monkeypatch.setattr("datagen.schemas.run._MOST_REMEMBERED", 2)
+    for commit in [*run.commits()][1:]:
+        run.remember(commit)
+    assert list(run.brief_commits()) == expected
+    for shard in (1, 2):  # the first two are not read again
+        (tmp_path / f"commits/{shard:06d}.json").write_bytes(b"")
+    assert list(run.brief_commits()) == expected
+    run.storage.delete(["commits/000001.json"])  # by a repair
+    assert [commit.shard for commit in run.brief_commits()] == [0, 2, 4]
+    (tmp_path / "commits/000004.json").write_bytes(b"")  # the third
+    with pytest.raises(InputError, match=r"000004\.json"):
+        list(run.brief_commits())
+
+
 def test_quarantine_takes_a_shard_from_the_missing_until_it_is_committed(tmp_path: Path) -> None:
     run = make_run(tmp_path, n=30, shards=[0])
     record = QuarantineRecord(
@@ -87,19 +107,12 @@ def test_quarantine_takes_a_shard_from_the_missing_until_it_is_committed(tmp_pat
     assert (run.missing(), run.quarantined()) == ([1], set())
 
 
-def test_an_object_is_written_once_and_read_as_committed(tmp_path: Path) -> None:
+def test_an_object_is_written_once(tmp_path: Path) -> None:
     run = make_run(tmp_path, shards=[])
     commit = write(run, 0, "a")
     with pytest.raises(InputError, match=r"shards/a\.zip: exists already"):
         run.write_object("a", b"others")
     assert run.committed() == set() and run.commit(commit) and run.read_object(commit)
-    data = (tmp_path / "shards/a.zip").read_bytes()
-    for changed in (data[:-1], data + b"x", bytes([data[0] ^ 1]) + data[1:]):
-        (tmp_path / "shards/a.zip").write_bytes(changed)
-        with pytest.raises(InputError, match=r"shards/a\.zip: has (other )?.*bytes"):
-            run.read_object(commit)
-    with pytest.raises(ValueError, match="attempt"):
-        commit_of(run, 0, "../x", FileEntry(path="a", size=0, sha256="0" * 64))
 
 
 def test_the_ledger_knows_who_began_and_who_never_ended(tmp_path: Path) -> None:
@@ -164,17 +177,6 @@ def test_hostile_commits_are_refused_with_file_and_field(tmp_path: Path) -> None
         file.truncate(2**35)
     with pytest.raises(InputError, match="34359738368 bytes, more than"):
         list(Run.open(tmp_path).commits())
-
-
-def test_broken_and_truncated_records_are_refused_with_their_file(tmp_path: Path) -> None:
-    run = make_run(tmp_path, shards=[0])
-    whole = (tmp_path / "commits/000000.json").read_bytes()
-    texts = (b"", b"{", b"[]", b"null", b"[" * 100_000, b"\xff\xff\xfe", b"{}", whole[:97], whole[:-1])
-    for text in texts:
-        (tmp_path / "commits/000000.json").write_bytes(text)
-        with pytest.raises(InputError) as e:
-            run.commit_of(0)
-        assert e.value.place.endswith("commits/000000.json") and len(str(e.value)) < 1000
 
 
 def test_edited_manifests_and_other_formats_and_versions_are_refused(tmp_path: Path) -> None:

@@ -54,19 +54,6 @@ def test_ranges_are_cut_at_the_end_of_a_file(place: str):
     assert s.get_range("a/none", 0, 1) is s.get_range("none", -1, 1) is None
 
 
-def test_many_files_come_back_in_order(place: str):
-    s = open_storage(place)
-    files = {f"k/{i:03d}": b"%d" % i for i in range(60)}
-    assert all(s.concurrent_map(lambda item: s.put_new(*item), files.items()))
-    keys = [*reversed(files), "none"]
-    assert list(s.get_many(keys, 9)) == [*((k, files[k]) for k in reversed(files)), ("none", None)]
-    assert {f.key: f.size for f in s.list("k")} == {k: len(v) for k, v in files.items()}
-    with pytest.raises(InputError, match="more than the 1 that"):
-        list(s.get_many(files, 1))
-    s.delete(files)
-    assert list(s.list("k")) == []
-
-
 def test_places_that_cannot_hold_a_run(tmp_path: Path):
     (tmp_path / "file").write_text("x")
     for place, problem in [
