@@ -52,17 +52,6 @@ class GraspSet:
         """Whether the grasp has at least `min_score`."""
         return row < len(self.score) or self.score_of(row) >= self.min_score
 
-    def with_poses(self, T_object_tcp: F64, opening_m: F64) -> GraspSet:
-        """Other poses (G, 4, 4) of the hand at the same object, none of them scored yet."""
-        pose_score = self.pose_score
-        assert pose_score is not None
-
-        def later_score(row: int) -> float:
-            return pose_score(T_object_tcp[row], float(opening_m[row]))
-
-        openings = opening_m.astype(np.float32)
-        return GraspSet(T_object_tcp, openings, self.score[:0], self.min_score, later_score, pose_score)
-
 
 Bools = npt.NDArray[np.bool_]
 

@@ -54,7 +54,6 @@ class Assembly:
     slides: Bools  # (A,)
     shoulder_m: F64  # (3,), base frame: where the reach is measured from
     reach_m: float
-    wrist_reach_m: float  # largest distance of the last joint from there
     scale: float
 
     @property
@@ -160,7 +159,7 @@ def assemble(source: RobotSource, reach_m: float | None) -> Assembly:
     found = Assembly(
         (*bodies, *hand.bodies), joints, mount, hand, base, base.T_root_mount, arm.coordinates,
         arm.coordinate, arm.ratio, arm.offset, arm.lower, arm.upper, arm.speed, arm.slides,
-        np.zeros(3), 0.0, 0.0, scale,
+        np.zeros(3), 0.0, scale,
     )  # fmt: skip
     return _with_reach(source, found, arm, hand)
 
@@ -171,9 +170,7 @@ def _with_reach(source: RobotSource, found: Assembly, arm: ArmChain, hand: Hand)
     if plain and len(found.names) == len(found.arm):
         chain = arm.chain(found.arm, found.palm.T_parent_child, hand)
         shoulder_m = (T_base_root @ found.arm[0].T_parent_child)[:3, 3]
-        unscaled = arm.chain(arm.joints(1.0), arm.palm(1.0, 0.0), hand)
         reach_m = largest_reach_m(chain)
-        wrist_m = found.scale * largest_reach_m(replace(unscaled, tcp_m=np.zeros(3)))
     else:
         # Lifts that come first stand in the middle of their range.
         tree = found.tree()
@@ -190,15 +187,13 @@ def _with_reach(source: RobotSource, found: Assembly, arm: ArmChain, hand: Hand)
                 break
         if arm.turns:
             shoulder_m = np.array([0.0, 0.0, shoulder_m[2]])
-        reach_m = farthest_m(tree, np.zeros(3), shoulder_m)
-        T_last_tcp = found.palm.T_parent_child @ hand.T_palm_tcp
-        wrist_m = farthest_m(tree, inverse(T_last_tcp)[:3, 3], shoulder_m)
+        reach_m = farthest_m(tree, shoulder_m)
     given = source.keys.reach_m
     if given is not None and abs(given - reach_m) > 0.01:
         raise source.wrong(
             "reach_m", f"is {given:g} m, and the URDF's arm has {reach_m:.3f} m", "Correct or omit it"
         )
-    return replace(found, shoulder_m=shoulder_m, reach_m=reach_m, wrist_reach_m=wrist_m)
+    return replace(found, shoulder_m=shoulder_m, reach_m=reach_m)
 
 
 def _tube(T_flange: F64, length_m: float, rule: ScaleKeys) -> F32:

@@ -91,16 +91,15 @@ def _cross_matrix(axis: F64) -> F64:
 _LOOKED_AT, _VALUES, _ROUNDS = 4096, 17, 12
 
 
-def farthest_m(tree: KinematicTree, point_m: F64, centre_m: F64) -> float:
-    """The largest distance from a point (3,) in the base frame to one (3,) in the TCP frame, metres.
+def farthest_m(tree: KinematicTree, centre_m: F64) -> float:
+    """The largest distance of the TCP from a point (3,) in the base frame, metres.
 
     For trees of any joints: coordinate ascent from the farthest of random positions over ever finer values.
     """
     rng = np.random.Generator(np.random.PCG64(0))
 
     def far(q: F64) -> F64:
-        T = frame_poses(tree, q, tcp_only=True)[:, 0]
-        return np.linalg.norm(T[:, :3, :3] @ point_m + T[:, :3, 3] - centre_m, axis=1)
+        return np.linalg.norm(frame_poses(tree, q, tcp_only=True)[:, 0, :3, 3] - centre_m, axis=1)
 
     q = rng.uniform(tree.lower, tree.upper, (_LOOKED_AT, len(tree.lower)))
     q = q[np.argsort(-far(q))[:_STARTS]]

@@ -6,14 +6,13 @@ import copy
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import ConvexHull
 
 from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import F32, F64, Mesh, concatenate
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.houses.glb import read_glb
-from datagen.workers.kinematics.inverse import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_M, TreePoses
+from datagen.workers.kinematics.inverse import TreePoses
 from datagen.workers.kinematics.tree import Coordinates, KinematicTree
 from datagen.workers.robots.arm_chain import TURN
 from datagen.workers.robots.assembly import assemble
@@ -25,7 +24,6 @@ from datagen.workers.robots.self_collision import SelfCollision
 from datagen.workers.robots.tucked import tucked_poses
 
 _GREY = 190
-_ROUNDING_M = 0.001  # far more than the rounding errors of lengths and tolerances
 _read_visual = lru_cache(maxsize=64)(read_glb)
 
 
@@ -50,9 +48,6 @@ class Robot:
         self.base_radius_m = base.radius_m  # None stands on a pedestal
         self.presents = source.keys.base.presents  # how the base stands to the target
         self.gripper = hand.gripper
-        self._tcp_wrist_m: F64 = inverse(assembly.palm.T_parent_child @ hand.T_palm_tcp)[:3, 3]
-        slack_m = POSITION_TOLERANCE_M + ANGLE_TOLERANCE_RAD * float(np.linalg.norm(self._tcp_wrist_m))
-        self._wrist_reach_m = assembly.wrist_reach_m + slack_m + _ROUNDING_M
         self.T_base_root: F64 = inverse(assembly.T_root_mount)  # (4, 4), pose of the URDF's root link
         # (3,), base frame: the point that reach_m is measured from; no TCP is ever farther.
         self.shoulder_m: F64 = assembly.shoulder_m
@@ -139,14 +134,6 @@ class Robot:
     def ik(self, T_base_tcp: F64, q_seed_rad: F64) -> F64 | None:
         """Joints (A,) within the limits that put the TCP at the pose (0.5 mm, 0.5 degrees), or None."""
         return self._poses.solve(T_base_tcp, q_seed_rad)
-
-    def is_wrist_within_reach(self, T_base_tcp: F64, beyond_m: float = 0.0) -> npt.NDArray[np.bool_]:
-        """Whether the last joint is at most `beyond_m` beyond its reach at each TCP pose (N, 4, 4); (N,).
-
-        `ik` fails at all poses where it is beyond its reach.
-        """
-        wrist_m = T_base_tcp[:, :3, :3] @ self._tcp_wrist_m + T_base_tcp[:, :3, 3]
-        return np.linalg.norm(wrist_m - self.shoulder_m, axis=1) <= self._wrist_reach_m + beyond_m
 
     def collides_itself(self, q_rad: F64) -> bool:
         """Whether any of `self_pairs` touch at the joints (A,)."""

@@ -99,19 +99,6 @@ def test_reach_is_the_largest_distance(robot: Robot) -> None:
     assert abs(best - robot.reach_m) < 0.01
 
 
-def test_the_wrist_is_never_beyond_its_reach_and_no_joints_lead_beyond(robot: Robot) -> None:
-    q = random_q(robot, 2000)
-    T = np.array([robot.T_base_tcp(x) for x in q])
-    low, high = robot.q_lower_rad, robot.q_upper_rad
-    assert robot.is_wrist_within_reach(T).all()
-    # It comes nearly as far out.
-    assert not robot.is_wrist_within_reach(T, beyond_m=-0.1 * robot.reach_m).all()
-    T[:, :3, 3] = robot.shoulder_m + 1.3 * (T[:, :3, 3] - robot.shoulder_m)
-    beyond = np.flatnonzero(~robot.is_wrist_within_reach(T))[:200]
-    assert len(beyond) > 10
-    assert all(robot.ik(T[k], np.clip(q[k], low, high)) is None for k in beyond)
-
-
 def test_base_frame(robot: Robot) -> None:
     q = np.where(robot.presents == "turns", 0.0, 1.0) * robot.homes_rad[0]
     T = robot.T_base_link(q)
