@@ -18,6 +18,10 @@ from datagen.schemas.identity import digest_of
 PANDA_REACH_M = 0.855
 
 Metres = Annotated[float, Field(ge=0.0, le=100.0, allow_inf_nan=False)]
+Corner = Annotated[
+    tuple[Annotated[float, Field(ge=-20.0, le=20.0)], Annotated[float, Field(ge=-20.0, le=20.0)]],
+    Field(strict=False),
+]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
@@ -40,6 +44,19 @@ class Range(_Frozen):
 
     @model_validator(mode="after")
     def _ordered(self) -> Range:
+        if self.high < self.low:
+            raise ValueError(f"high {self.high} is below low {self.low}")
+        return self
+
+
+class Turns(_Frozen):
+    """A closed interval of angles in radians, counter-clockwise, from which one is sampled uniformly."""
+
+    low: float = Field(ge=-3.14159266, le=3.14159266)
+    high: float = Field(ge=-3.14159266, le=3.14159266)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Turns:
         if self.high < self.low:
             raise ValueError(f"high {self.high} is below low {self.low}")
         return self
@@ -102,7 +119,7 @@ class ObservationParams(_Frozen):
 
 
 class CandidateParams(_Frozen):
-    """Base positions around the target and their robots (paper, Sec. IV-A)."""
+    """Base poses around the target and their robots (paper, Sec. IV-A)."""
 
     per_scene: Annotated[int, Field(ge=1, le=625)] | Literal["grid"] = 60
     grid_cells: int = Field(default=25, ge=2, le=200)
@@ -120,7 +137,27 @@ class CandidateParams(_Frozen):
     base_radius_m: Metres = 0.25
     # Bases of arms shorter than the Panda are narrower in proportion; None: all alike.
     scaled_base: bool | None = None
+    # Corners of the base around the mount, x ahead, of which the convex hull counts; None: the circle.
+    footprint_m: Annotated[tuple[Corner, ...], Field(strict=False, min_length=3, max_length=100)] | None = (
+        None
+    )
     mast_radius_m: Metres = 0.05
+    # Heading of the base, relative to the direction from it to the target; None: the base faces the target.
+    yaw_rad: Turns | None = None
+
+    @model_validator(mode="after")
+    def _holds_mount(self) -> CandidateParams:
+        if self.footprint_m is not None:
+            x, y = np.array(self.footprint_m).T
+            angle = np.sort(np.arctan2(y, x))
+            if np.diff(angle, append=angle[0] + 2 * np.pi).max() >= np.pi:
+                raise ValueError("footprint_m does not hold the mount, its origin")
+        return self
+
+    @property
+    def samples_yaw(self) -> bool:
+        """Whether headings differ between candidates with one direction to the target."""
+        return self.yaw_rad is not None and self.yaw_rad.low < self.yaw_rad.high
 
     @property
     def count(self) -> int:

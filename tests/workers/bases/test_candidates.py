@@ -153,7 +153,15 @@ def plain_candidates(
         camera, mount, reach = (np.full(len(xy_m), v[k]) for v in (camera_m, mount_m, reach_m))
         radius_m = params.radius_of_base_m(reach)
         clearance_m = base_clearance_m(xy_m, mount, camera, radius_m, obstacles, params.mast_radius_m)
-        there = SceneCandidates(xy_m, np.zeros(len(xy_m), np.int16), camera, mount, reach, clearance_m)
+        there = SceneCandidates(
+            xy_m,
+            np.zeros(len(xy_m), np.float32),
+            np.zeros(len(xy_m), np.int16),
+            camera,
+            mount,
+            reach,
+            clearance_m,
+        )
         inside = clearance_m >= 0
         if params.within == "in-range":
             inside &= distances(there, target_m)[1] <= reach
@@ -171,7 +179,9 @@ def plain_candidates(
             clearance_m = base_clearance_m(
                 xy_m[rows], heights[1], heights[0], radius_m, obstacles, params.mast_radius_m
             )
-            return SceneCandidates(xy_m[rows], index, *heights, reach_m[robot], clearance_m)
+            return SceneCandidates(
+                xy_m[rows], np.zeros(n, np.float32), index, *heights, reach_m[robot], clearance_m
+            )
     return None
 
 
