@@ -46,7 +46,9 @@ def test_sampled_headings_are_stored_and_no_model_trains_on_them(
     np.testing.assert_array_equal(arrays_of(run)["base_xy_m"], plain["base_xy_m"])
     assert cli.run(["verify", str(run), "--replay", "1"]) == 0
     words = ("candidates.yaw_rad", "headings of the base are sampled")
-    refused(["train", "stage1", str(run), "--out", str(tmp_path / "a.ckpt")], capsys, *words)
+    for trained, validated in ((run, tmp_path / "plain"), (tmp_path / "plain", run)):
+        line = ["train", "stage1", str(trained), "--val", str(validated)]
+        refused([*line, "--out", str(tmp_path / "a.ckpt")], capsys, str(run), *words)
 
 
 @pytest.mark.parametrize(
