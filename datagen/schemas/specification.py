@@ -10,59 +10,23 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from datagen.schemas.identity import digest_of
+from datagen.schemas.intervals import Corner, Fraction, Frozen, Interval, Metres, Range, Turns
 
 # The reach that Franka Emika states for the Panda.
 PANDA_REACH_M = 0.855
 
-Metres = Annotated[float, Field(ge=0.0, le=100.0, allow_inf_nan=False)]
-Corner = Annotated[
-    tuple[Annotated[float, Field(ge=-20.0, le=20.0)], Annotated[float, Field(ge=-20.0, le=20.0)]],
-    Field(strict=False),
-]
-Fraction = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
-
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class Source(_Frozen):
+class Source(Frozen):
     """The source of houses or objects: the registry name and a digest of the content."""
 
     kind: str
     digest: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
-class Range(_Frozen):
-    """A closed interval in metres, from which a length is sampled uniformly."""
-
-    low: Metres
-    high: Metres
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Range:
-        if self.high < self.low:
-            raise ValueError(f"high {self.high} is below low {self.low}")
-        return self
-
-
-class Turns(_Frozen):
-    """A closed interval of angles in radians, counter-clockwise, from which one is sampled uniformly."""
-
-    low: float = Field(ge=-3.14159266, le=3.14159266)
-    high: float = Field(ge=-3.14159266, le=3.14159266)
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Turns:
-        if self.high < self.low:
-            raise ValueError(f"high {self.high} is below low {self.low}")
-        return self
-
-
-class SceneParams(_Frozen):
+class SceneParams(Frozen):
     """Choice of support surface, target and clutter."""
 
     n_clutter: int = Field(default=6, ge=0, le=30)
@@ -74,7 +38,7 @@ class SceneParams(_Frozen):
     max_retries: int = Field(default=200, ge=1, le=10_000)
 
 
-class SettleParams(_Frozen):
+class SettleParams(Frozen):
     """Physics until rest."""
 
     engine: str = "sapien"
@@ -88,7 +52,7 @@ class SettleParams(_Frozen):
     max_drop_m: Metres = 0.05
 
 
-class NoiseParams(_Frozen):
+class NoiseParams(Frozen):
     """Stereo-like depth noise; `enabled=False` leaves the frame exact."""
 
     enabled: bool = False
@@ -99,7 +63,7 @@ class NoiseParams(_Frozen):
     hole_rate: Fraction = 0.002
 
 
-class ObservationParams(_Frozen):
+class ObservationParams(Frozen):
     """One RGB-D frame; intrinsics like a RealSense D435 colour stream at 640x480."""
 
     renderer: str = "embree"
@@ -118,7 +82,7 @@ class ObservationParams(_Frozen):
     noise: NoiseParams = NoiseParams()
 
 
-class CandidateParams(_Frozen):
+class CandidateParams(Frozen):
     """Base poses around the target and their robots (paper, Sec. IV-A)."""
 
     per_scene: Annotated[int, Field(ge=1, le=625)] | Literal["grid"] = 60
@@ -170,7 +134,7 @@ class CandidateParams(_Frozen):
         return self.base_radius_m * share
 
 
-class GraspParams(_Frozen):
+class GraspParams(Frozen):
     """Grasps of the target: the number to search, and the number to look at for all candidates of a scene."""
 
     per_object: int = Field(default=4000, ge=1, le=10_000)
@@ -180,7 +144,7 @@ class GraspParams(_Frozen):
     min_score: Fraction = 0.5
 
 
-class MotionParams(_Frozen):
+class MotionParams(Frozen):
     """The kinematic stage: IK, collisions, path, straight approach and lift."""
 
     ik_seeds: int = Field(default=4, ge=1, le=100)
@@ -200,7 +164,7 @@ class MotionParams(_Frozen):
     margin_m: float = Field(default=0.005, ge=0, le=0.2)
 
 
-class TrialParams(_Frozen):
+class TrialParams(Frozen):
     """Execution in physics: the whole planned path, close, lift, hold."""
 
     timestep_s: float = Field(default=1 / 200, ge=1e-4, le=0.02)
@@ -228,11 +192,7 @@ class TrialParams(_Frozen):
         return self
 
 
-class Interval(Range):
-    """A closed interval, without unit, from which a number is sampled uniformly."""
-
-
-class DisturbanceParams(_Frozen):
+class DisturbanceParams(Frozen):
     """Disturbed labels: the robot arrives near a candidate `repeats` times and plans from there.
 
     It knows its pose, but not the errors of the target's pose, friction and mass, which only trials show.
@@ -254,7 +214,7 @@ class DisturbanceParams(_Frozen):
         return self
 
 
-class ArmParams(_Frozen):
+class ArmParams(Frozen):
     """The arm of the label sources `plan` and `sim`; `trial` is None for `plan`."""
 
     robot: str = "panda-scaled"
@@ -272,19 +232,19 @@ class ArmParams(_Frozen):
         return self.robot if self.robot_digest is None else f"{self.robot}@{self.robot_digest}"
 
 
-class ScenesFrom(_Frozen):
+class ScenesFrom(Frozen):
     """The run whose scenes and candidates are labelled again."""
 
     spec_hash: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
-class VisibilityParams(_Frozen):
+class VisibilityParams(Frozen):
     """Rays of the visibility window (n x n, fitted to the target's bounding sphere)."""
 
     window_px: int = Field(default=64, ge=8, le=512)
 
 
-class HeuristicParams(_Frozen):
+class HeuristicParams(Frozen):
     """The distance-visibility label (paper, Sec. III-B).
 
     The paper gives the weights, the threshold, the distance bounds and the visibility score, but not a, mu,
@@ -308,7 +268,7 @@ class HeuristicParams(_Frozen):
         return self
 
 
-class Specification(_Frozen):
+class Specification(Frozen):
     """All that decides the samples of a run."""
 
     label_source: str = "heuristic"
