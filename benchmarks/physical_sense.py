@@ -33,7 +33,6 @@ from datagen.workers.labels.arm_labelling import (
     try_candidate,
 )
 from datagen.workers.motion import MotionPlan
-from datagen.workers.motion.planning_scene import pose_of_base
 from datagen.workers.objects import open_objects
 from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.trials import Disturbance
@@ -95,9 +94,7 @@ def planned_cases(options: argparse.Namespace) -> tuple[Specification, list[Case
         for row in range(len(candidates)):
             made = try_candidate(at, candidates, row, plan_only)
             if made.plan is not None:
-                xy = candidates.base_xy_m[row].astype(np.float64)
-                T = pose_of_base(xy, at.robot.base_height_m, scene.target_center_m)
-                cases.append(Case(at, candidates, row, T, made.plan))
+                cases.append(Case(at, candidates, row, at.base_pose(candidates, row), made.plan))
                 found += 1
             if found == options.plans:
                 break

@@ -28,12 +28,12 @@ from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import ArmParams
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.geometry.transforms import inverse, quaternion_wxyz
+from datagen.workers.geometry.transforms import inverse, quaternion_wxyz, yaw_pose
 from datagen.workers.grasps.grasp_cache import grasps_of
 from datagen.workers.houses import open_houses
 from datagen.workers.motion import PlanReport
 from datagen.workers.motion.plan_candidate import plan_candidate
-from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
+from datagen.workers.motion.planning_scene import PlanningScene, prepare
 from datagen.workers.objects import open_objects
 from datagen.workers.robots import open_robot, robot_limits
 from datagen.workers.robots.resources import package_folders
@@ -117,8 +117,8 @@ def _plan_grid(
     for row in range(len(candidates)):
         outcome = "base_collision"
         if candidates.clearance_m[row] >= 0:
-            base_xy_m = candidates.base_xy_m[row].astype(np.float64)
-            T_world_base = pose_of_base(base_xy_m, height_m, scene.target_center_m)
+            (x, y), yaw_rad = candidates.base_xy_m[row].tolist(), float(candidates.base_yaw_rad[row])
+            T_world_base = yaw_pose(x, y, height_m, yaw_rad)
             start_s = time.process_time()
             outcome, report = _outcome(prepared, T_world_base, options.seed, scene, row)
             measured("plan", start_s)

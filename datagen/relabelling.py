@@ -109,6 +109,8 @@ def relabel_run(storage: Storage, source: Run, spec: Specification, json: bool =
 def _open_target(storage: Storage, source: Run, spec: Specification) -> Run:
     known = source.manifest.sources
     manifest = manifest_of(spec, source.layout, {**known, "scenes_from": source.storage.url})
+    # Its other arrays are copied as they are.
+    manifest = manifest.model_copy(update={"schema_version": source.manifest.schema_version})
     run = Run.create_or_open(storage, manifest, source.n)
     if run.layout != source.layout:
         problem = f"is {run.layout.scenes_per_shard}, unlike in the source"

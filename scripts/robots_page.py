@@ -22,8 +22,9 @@ _TAIL = """
 Reach is the largest distance from the shoulder to the TCP within the joint limits: from the first joint,
 and where the arm stands on a lift from its middle. The mount, where a candidate's (x, y) lies, is the
 arm's foot on a pedestal; on a robot's own base it is the first joint that turns, with lifts down. A base
-that turns in place does so about the mount, and its turn is one of the coordinates. Other reaches and
-heights are refused.
+that turns in place does so about the mount, its turn is one of the coordinates, and it needs the circle that
+it sweeps; other bases need their outline, at the heading of the candidate. Other reaches and heights are
+refused.
 
 - **Files** of `panda`, `panda-scaled`, `xarm7` and `fetch` come with ManiSkill; those of the others with
   the extra `robots` (`hello-robot-stretch-urdf`, `example-robot-data`). Nothing of them is in this

@@ -26,6 +26,12 @@ Fields that are absent by default are commented out, with the values that they h
 _RESERVED = {"label_source", "houses", "objects", "scenes_from", "engines"}
 # Set by the program, from the robot that is named.
 _DERIVED = {"arm.robot_digest", "arm.joints"}
+# Absent by default, of a form that the model does not show.
+_EXAMPLES = {
+    "candidates.footprint_m": "[[0.3, 0.2], [-0.3, 0.2], [-0.3, -0.2], [0.3, -0.2]]"
+    "  # absent, or 3..100 corners",
+    "candidates.yaw_rad": "{low=-0.5, high=0.5}  # absent, or within -3.14159..3.14159",
+}
 _LENGTH = {"≥": "0", "≤": "100"}  # the bounds of every length
 _LIMITS = ((Ge, "≥", "ge"), (Gt, ">", "gt"), (Le, "≤", "le"), (Lt, "<", "lt"))
 
@@ -48,7 +54,9 @@ def _write(
             continue
         default: Any = field.get_default(call_default_factory=True)
         below = type(default) if isinstance(default, BaseModel) else _section_of(field.annotation)
-        if isinstance(default, (Range, Interval)):
+        if f"{prefix}{name}" in _EXAMPLES:
+            rows.append(f"{mark}# {name} = {_EXAMPLES[f'{prefix}{name}']}")
+        elif isinstance(default, (Range, Interval)):
             rows.append(f"{mark}{name} = {{low={default.low}, high={default.high}}}")
         elif below is not None:
             hidden = absent or default is None

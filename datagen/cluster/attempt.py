@@ -37,7 +37,9 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
     stored = None if scenes_run is None else list(read_scenes(scenes_run, task.scene_indices))
     made = run_shard(task.spec, world, task.scene_indices, stored, meter.watch)
     with ends_job(), made.clock.stage("write"):
-        data = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
+        # A run of an older version keeps its arrays.
+        sample = {field.name: made.sample[field.name] for field in run.schema.sample_fields}
+        data = encode_shard(run.schema, run.layout, spec_hash, made.scene, sample)
         entry = run.write_object(task.attempt, data)
     labels = made.sample["label"]
     cost = meter.cost(made.clock, written_bytes=entry.size)

@@ -20,6 +20,7 @@ from datagen.released import DEMO_BASE_HEIGHT_M, DEMO_CLICK, DEMO_REACH_M, sampl
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import whole_file
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.robots import robot_limits
 
 if TYPE_CHECKING:
     from datagen.train.prediction import Footprint, Prediction
@@ -86,8 +87,10 @@ class PredictOptions:
     Args:
         checkpoint: Checkpoint of `datagen train`; in Python also a scorer of `datagen.load_scorer`
             [default: the released model]
-        base_height: Height of the arm's mount above the floor (m); only --demo has a default.
-        reach: Reach of the arm from its mount (m); only --demo has a default.
+        robot: Robot, or its file ROBOT.toml: gives its heading, and what is not given of its mount's height,
+            reach and base.
+        base_height: Height of the arm's mount above the floor (m).
+        reach: Reach of the arm from its mount (m).
         demo: Predict on the frame that ships with the package; writes demo.png and demo.html.
         frame: Frame as a folder, .npz or .ply; several with poses are fused.
         click: Pixel u,v on the target in the first frame, where it has no mask.
@@ -105,6 +108,7 @@ class PredictOptions:
 
     checkpoint: Annotated[Checkpoint | None, Parameter(name="CHECKPOINT")] = None
     _: KW_ONLY
+    robot: str | None = None
     base_height: float | None = None
     reach: float | None = None
     demo: bool = False
@@ -153,7 +157,7 @@ def predict(given: PredictOptions) -> Prediction:
 
     Returns:
         All poses. `best` is the row of the best clear one (None where none was seen to be clear),
-        `T_world_base(row)` and `T_camera_base(row)` are 4x4 poses of the arm's mount (x towards the target),
+        `T_world_base(row)` and `T_camera_base(row)` are 4x4 poses of the arm's mount (x to the base's front),
         `base_xy_m` (N, 2) and `yaw_rad` (N,) those of all rows, `score` (N,) their scores, and `sure` the
         confidence in the answer. World is the frame of `T_world_camera` where frames have it, as a
         robot's map; else its origin is on the floor below the camera. A frame in Python may also be a
@@ -186,6 +190,7 @@ def predict(given: PredictOptions) -> Prediction:
             out=given.out or DEMO_PICTURE,
             html=given.html or DEMO_PAGE,
         )
+    given, yaw_rad = (given, 0.0) if given.robot is None else _of_robot(given, given.robot)
     size = (_required(given.base_height, "--base-height"), _required(given.reach, "--reach"))
     outline = None if given.footprint is None else read_footprint(given.footprint)
     error = None if given.arrival is None else read_arrival(given.arrival)
@@ -201,7 +206,7 @@ def predict(given: PredictOptions) -> Prediction:
     answer = scored(
         load_scorer(scorer) if scorer is None or isinstance(scorer, (str, Path)) else scorer,
         frames,
-        RobotSize(_required(own_height, "--camera-height"), *size, outline),
+        RobotSize(_required(own_height, "--camera-height"), *size, outline, yaw_rad),
         camera_height_m=given.camera_height,
         gravity=direction,
         click=given.click,
@@ -219,6 +224,19 @@ def predict(given: PredictOptions) -> Prediction:
         with whole_file(html, alone=True) as file:
             file.write(page_of(answer).encode())
     return answer
+
+
+def _of_robot(given: PredictOptions, robot: str) -> tuple[PredictOptions, float]:
+    """The options with a robot's sizes where they give none, and its heading to the target (rad)."""
+    limits = robot_limits(robot)
+    (low, high), heights = limits.reach_m, limits.base_height_m
+    sizes = {
+        "reach": high if low == high else None,
+        "base_height": heights[0] if heights is not None and heights[0] == heights[1] else None,
+        "footprint": None if limits.base_radius_m is None else robot,
+    }
+    missing = {name: value for name, value in sizes.items() if getattr(given, name) is None}
+    return replace(given, robot=None, **missing), limits.yaw_rad
 
 
 def _required(value: T | None, option: str) -> T:

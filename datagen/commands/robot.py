@@ -103,11 +103,16 @@ def _base(robot: Robot) -> Rows:
     if base.height_m is not None:
         given = keys.base.footprint_m or keys.base.radius_m
         within = f"{outline} within {base.radius_m:.3f} m of the mount"
-        presents = "turns in place to" if robot.presents == "turns" else "faces"
+        side_deg = keys.base.side_deg or 0.0
+        presents = {
+            "faces": "faces the target",
+            "turns": "turns in place to the target",
+            "side": f"stands with the target {side_deg:g} deg from its front, counter-clockwise",
+        }
         rows = [
             ("mount", f"{base.height_m:.3f} m above the floor{_origin(keys.base.height_m)}"),
             ("footprint", within + _origin(given)),
-            ("base", f"{presents} the target"),
+            ("base", presents[robot.presents]),
         ]
     tucked = f"{len(robot.homes_rad)} poses{_origin(keys.arm.tucked)}"
     shapes = f"{parts} convex parts of {len(robot.link_names)} bodies, {pairs} pairs checked"

@@ -8,6 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
 from datagen import __version__
@@ -24,9 +25,12 @@ from datagen.schemas.specification import (
     Range,
     Source,
     Specification,
+    Turns,
 )
+from datagen.workers.bases.candidates import footprint_of
 from datagen.workers.engine_versions import ARM_PACKAGES, arm_versions, label_engines, scene_engines
 from datagen.workers.extras import how_to_get, versions_of
+from datagen.workers.geometry.planar import crosses_itself
 from datagen.workers.houses.house import HouseSource
 from datagen.workers.labels import load_label_source
 from datagen.workers.objects.model import ObjectSource
@@ -40,7 +44,7 @@ Options = Mapping[str, Any]  # by dotted name in the specification; None where n
 # Sections of the arm that only some label sources have.
 _NOT_FOR: dict[str, tuple[str, ...]] = {"plan": ("trial",), "sim": ()}
 # Reaches are stated in whole millimetres.
-_STEP_M = 0.001
+_STEP_M, _SAME_RAD = 0.001, 1e-6
 # Step between sampled reaches: opening an arm of another reach costs as much as planning ten candidates.
 REACH_STEP_M = 0.01
 _LIBRARIES = ("numpy", "scipy", "embreex", "sapien", "pybullet", "zarr", "obstore", "ray", "trimesh")
@@ -103,6 +107,9 @@ def specify(
     if spec.candidates.per_scene == "grid" and spec.candidates.within is not None:
         problem = f"a whole grid has cells that are not {spec.candidates.within}"
         raise InputError(place, "candidates.within", problem, "Give --candidates-per-scene 60")
+    footprint_m = spec.candidates.footprint_m
+    if footprint_m is not None and crosses_itself(np.array(footprint_m)):
+        raise InputError(place, "candidates.footprint_m", "crosses itself", "Give its corners in order")
     if chosen is not None:
         refuse_unsuited(spec, chosen, place, "Correct the values, or choose another --robot")
     for field, name, registry in (
@@ -286,6 +293,10 @@ def narrow_candidates(fields: Fields, robot: str) -> None:
         candidates.setdefault("base_height_m", _narrowed(defaults.base_height_m, limits.base_height_m))
     if limits.base_radius_m is not None:
         candidates.setdefault("base_radius_m", limits.base_radius_m)
+    if limits.polygon_m is not None:
+        candidates.setdefault("footprint_m", limits.polygon_m)
+    if limits.presents == "side":
+        candidates.setdefault("yaw_rad", {"low": limits.yaw_rad, "high": limits.yaw_rad})
 
 
 def refuse_unsuited(spec: Specification, robot: str, place: str, fix: str) -> None:
@@ -299,10 +310,16 @@ def refuse_unsuited(spec: Specification, robot: str, place: str, fix: str) -> No
             has = f"{limit[0]:g} to {limit[1]:g} m" if limit[0] < limit[1] else f"{limit[0]:g} m"
             problem = f"{given.low:g} to {given.high:g} m, and robot {robot} has {has}"
             raise InputError(place, f"candidates.{field}", problem, fix)
-    own_m = limits.base_radius_m
+    own_m, footprint = limits.base_radius_m, footprint_of(candidates)
     if own_m is not None and candidates.base_radius_m < own_m - _STEP_M:
         problem = f"{candidates.base_radius_m:g} m, and the base of robot {robot} has {own_m:g} m"
         raise InputError(place, "candidates.base_radius_m", problem, fix)
+    if own_m is not None and footprint is not None and not footprint.holds(limits.polygon_m, own_m, _STEP_M):
+        raise InputError(place, "candidates.footprint_m", f"does not hold the base of robot {robot}", fix)
+    turns, own_rad = candidates.yaw_rad or Turns(low=0.0, high=0.0), limits.yaw_rad
+    if limits.presents == "side" and not turns.low - _SAME_RAD <= own_rad <= turns.high + _SAME_RAD:
+        problem = f"is {turns.low:g} to {turns.high:g}, and robot {robot} stands at {own_rad:g} to the target"
+        raise InputError(place, "candidates.yaw_rad", problem, fix)
 
 
 def _narrowed(default: Range, limit: tuple[float, float]) -> dict[str, float]:

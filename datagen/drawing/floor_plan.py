@@ -26,7 +26,7 @@ from datagen.display.styles import (
 )
 from datagen.schemas.fields import OUTCOMES
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.geometry.planar import convex_hull
+from datagen.workers.geometry.planar import convex_hull, polygons_at
 from datagen.workers.houses.house import StaticBody
 from datagen.workers.scenes.reconstruct import ReconstructedScene
 
@@ -111,6 +111,16 @@ def draw_pick(axes: Axes, base_xy_m: F64, style: Style) -> Handle:
     look: dict[str, Any] = {"color": style.colour, "edgecolors": style.edge, "lw": 1, "zorder": 9}
     axes.scatter(*base_xy_m, marker=_marker(style), s=190, **look)
     return handle(style, style.words)
+
+
+def draw_base(axes: Axes, polygon_m: F64, base_xy_m: F64, yaw_rad: float, style: Style) -> None:
+    """Draw the outline (K, 2) of a base, x ahead, at its pose, with a line from the mount to its front."""
+    front_m = np.array([[0.0, 0.0], [float(polygon_m[:, 0].max()), 0.0]])
+    outline, line = (
+        polygons_at(points, base_xy_m[None], np.array([yaw_rad]))[0] for points in (polygon_m, front_m)
+    )
+    axes.add_patch(Polygon(outline, closed=True, fill=False, ec=style.edge, lw=1.2, zorder=8))
+    axes.plot(*line.T, color=style.edge, lw=1.2, zorder=8)
 
 
 def draw_legend(axes: Axes, handles: Sequence[Handle]) -> float:

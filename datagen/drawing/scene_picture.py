@@ -12,10 +12,19 @@ import numpy as np
 
 from datagen.display.figures import draw_frame, new_sheet, save_sheet, write_facts
 from datagen.display.styles import BEST, BEST_BY_SCORE
-from datagen.drawing.floor_plan import draw_candidates, draw_legend, draw_pick, draw_plan, draw_scores
+from datagen.drawing.floor_plan import (
+    draw_base,
+    draw_candidates,
+    draw_legend,
+    draw_pick,
+    draw_plan,
+    draw_scores,
+)
 from datagen.schemas.fields import OUTCOMES, REDRAW_CAUSES, SceneRows
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import Specification
+from datagen.workers.bases.candidates import footprint_of
+from datagen.workers.geometry.mesh import F64
 from datagen.workers.rendering import Frame
 from datagen.workers.scenes.generate import render_frame
 from datagen.workers.scenes.reconstruct import ReconstructedScene
@@ -24,6 +33,7 @@ Columns = Mapping[str, Any]
 Lines = list[tuple[str, str]]  # printed next to a picture
 
 _MOST_ROBOTS = 4
+_SIDES = 49  # of a drawn circle
 _PLANS_IN = 3.7  # height of the upper half
 
 
@@ -61,6 +71,14 @@ class Shown:
         x, y = self.samples["base_xy_m"][row]
         return f"({x:.3f}, {y:.3f}) m"
 
+    def base_polygon_m(self, row: int) -> F64:
+        """Outline (K, 2) of a candidate's base around its mount, x ahead."""
+        footprint, angle = footprint_of(self.spec.candidates), np.linspace(0, 2 * np.pi, _SIDES)
+        if footprint is not None:
+            return footprint.polygon_m
+        radius_m = float(self.spec.candidates.radius_of_base_m(self.samples["arm_reach_m"][row]))
+        return radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
 
 def draw_scene_picture(shown: Shown, out: Path) -> Lines:
     """Write the picture of a scene; return its positives and its best base poses."""
@@ -78,6 +96,7 @@ def draw_scene_picture(shown: Shown, out: Path) -> Lines:
     upper.colorbar(scale, ax=[label_ax, score_ax], shrink=0.8, label=f"H (good from {tau:.2g} on)")
     picks = [(row, style) for row, style in _picks(samples).values() if row is not None]
     for row, style in picks:
+        draw_base(label_ax, shown.base_polygon_m(row), xy[row], float(samples["base_yaw_rad"][row]), style)
         draw_pick(label_ax, xy[row], style)
         legend.append(draw_pick(score_ax, xy[row], style))
     label_ax.set_title("candidates by outcome" if "outcome" in samples else "candidates by label")

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 Stopping = Callable[[], bool]
 # Raise it when the same arrival would have another outcome for a reason that `engines` does not name.
-_VERSION = 1
+_VERSION = 2
 _MOST_BYTES = 64 << 20
 _WORLD = 2  # purposes 0 and 1 of a scene's generators are picks and arrivals
 PLAN, SIM = "plan", "sim"

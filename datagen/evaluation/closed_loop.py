@@ -152,7 +152,7 @@ def pick_cells(
     for name, score in (raw | {BY_LABELS: maps.truth}).items():
         cells[name, "nominal"] = np.stack([best(score)] * len(arrivals))
         cells[name, "smoothed"] = np.stack(
-            [best(smoothed(values[name], maps.step_m, arrival)) for arrival in arrivals]
+            [best(smoothed(values[name], maps, arrival)) for arrival in arrivals]
         )
     within = best(columns.is_reachable[maps.order].astype(np.float64), luck[:, 1])
     return cells | {(AT_RANDOM, "nominal"): np.stack([within] * len(arrivals))}
@@ -245,8 +245,9 @@ def label_success(columns: Columns, maps: GridMaps, cells: I64, offsets: F64) ->
     """
     scene = np.arange(len(maps.order))
     xy = columns.base_xy_m.astype(np.float64)[maps.order.reshape(len(scene), -1)]  # (S, Y * X, 2)
-    goal = xy[scene, cells][:, :, None]  # (E, S, 1, 2), which faces the target at the origin
-    yaw = np.arctan2(-goal[..., 1], -goal[..., 0])
+    goal = xy[scene, cells][:, :, None]  # (E, S, 1, 2)
+    headings = columns.base_yaw_rad.astype(np.float64)[maps.order.reshape(len(scene), -1)]
+    yaw = headings[scene, cells][:, :, None]
     x = goal[..., 0] + np.cos(yaw) * offsets[..., 0] - np.sin(yaw) * offsets[..., 1] - xy[:, 0, 0][:, None]
     y = goal[..., 1] + np.sin(yaw) * offsets[..., 0] + np.cos(yaw) * offsets[..., 1] - xy[:, 0, 1][:, None]
     where = [np.broadcast_to(scene[:, None], x.shape).astype(np.float64), y / maps.step_m, x / maps.step_m]

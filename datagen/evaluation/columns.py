@@ -16,7 +16,7 @@ from datagen.workers.bases.candidate_sets import in_set
 
 # Further columns of a batch that the evaluation needs.
 EXTRA = (
-    *("base_is_clear", "distance_m", "mount_distance_m", "visibility", "outcome"),
+    *("base_yaw_rad", "base_is_clear", "distance_m", "mount_distance_m", "visibility", "outcome"),
     *("house_id", "object_name", "object_digest", "scene_index"),
 )
 
@@ -31,6 +31,7 @@ class Columns:
     is_clear: Bools  # (N,)
     outcome: U8  # (N,) codes of OUTCOMES
     base_xy_m: F32  # (N, 2), target frame
+    base_yaw_rad: F32  # (N,), world, whose axes the target frame has
     distance_m: F32  # (N,)
     mount_distance_m: F32  # (N,)
     reach_m: F32  # (N,)
@@ -118,7 +119,10 @@ def _rows(batch: Batch[Array], first_scene: int, first_robot: int) -> dict[str, 
         "outcome": batch.extra["outcome"],
         "base_xy_m": batch.candidates.base_xy_m,
         "reach_m": batch.robots.arm_reach_m[robot],
-        **{name: batch.extra[name] for name in ("distance_m", "mount_distance_m", "visibility")},
+        **{
+            name: batch.extra[name]
+            for name in ("base_yaw_rad", "distance_m", "mount_distance_m", "visibility")
+        },
     }
 
 

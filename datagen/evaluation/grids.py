@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 
 from datagen.evaluation.columns import Columns
 from datagen.evaluation.comparisons import Method
+from datagen.schemas.stored_arrays import facing_rad
 from datagen.train.arrivals import Arrival, expected_success, ring_arrival, stands
 from datagen.train.bootstrap import Estimate, Weights, summed
 from datagen.train.inputs import F64, Bools, Ints
@@ -94,6 +95,7 @@ class GridMaps:
     truth: F64  # (S, Y, X)
     is_clear: Bools  # (S, Y, X)
     step_m: float
+    yaw_rad: F64  # (S,), heading of the bases relative to the direction to the target
 
 
 def grid_maps(columns: Columns) -> GridMaps | None:
@@ -109,7 +111,10 @@ def grid_maps(columns: Columns) -> GridMaps | None:
     step_m = float(wide_m.mean() / (side - 1))
     order = np.lexsort([np.round(x / step_m * 2), np.round(y / step_m * 2), columns.scene])
     order = order.reshape(columns.n_scenes, side, side)
-    return GridMaps(order, columns.label[order].astype(np.float64), columns.is_clear[order], step_m)
+    corner = order[:, 0, 0]
+    yaw_rad = columns.base_yaw_rad[corner] - facing_rad(-columns.base_xy_m[corner])
+    truth, is_clear = columns.label[order].astype(np.float64), columns.is_clear[order]
+    return GridMaps(order, truth, is_clear, step_m, np.round(yaw_rad, 5))  # stored as float32
 
 
 def arrival_table(
@@ -132,11 +137,11 @@ def arrival_table(
     chances = {m.name: method_values(raw[m.name], maps, m) for m in methods}
     found: list[dict[str, Any]] = []
     for arrival in [*map(ring_arrival, DISTANCES_M), *given]:
-        truth = smoothed(maps.truth, maps.step_m, arrival)
+        truth = smoothed(maps.truth, maps, arrival)
         per_scene = {
             name: {
                 "nominal": _picked(raw[name], truth, maps.is_clear),
-                "smoothed": _picked(smoothed(chance, maps.step_m, arrival), truth, maps.is_clear),
+                "smoothed": _picked(smoothed(chance, maps, arrival), truth, maps.is_clear),
             }
             for name, chance in chances.items()
         }
@@ -168,9 +173,10 @@ def method_values(score: F64, maps: GridMaps, method: Method) -> F64:
     return value
 
 
-def smoothed(value: F64, step_m: float, arrival: Arrival) -> F64:
+def smoothed(value: F64, maps: GridMaps, arrival: Arrival) -> F64:
     """Maps (S, Y, X) of the mean value over the arrivals of a robot that is sent to each cell."""
-    return np.stack([expected_success(each, step_m, arrival) for each in value])
+    goals = zip(value, maps.yaw_rad.tolist(), strict=True)
+    return np.stack([expected_success(each, maps.step_m, arrival.turned(yaw)) for each, yaw in goals])
 
 
 def _picked(value: F64, truth: F64, is_clear: Bools) -> F64:

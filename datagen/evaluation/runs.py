@@ -14,7 +14,7 @@ from datagen.schemas.run import open_runs
 from datagen.schemas.specification import Specification
 from datagen.train.baselines import FIELDS
 from datagen.train.dataset import SampleStream
-from datagen.train.run_parts import refuse_mixed_labels
+from datagen.train.run_parts import refuse_mixed_labels, refuse_sampled_yaw
 from datagen.workers.bases.candidate_sets import CANDIDATE_SETS
 
 # Whole scenes: a model scores a few scenes of 625 candidates at once.
@@ -96,7 +96,9 @@ def open_evaluated_runs(paths: Sequence[str]) -> list[EvaluatedRun]:
             problem = f"is {second}, but {at} has {first} labels"
             raise InputError(path, "label_source", problem, "Evaluate the two runs separately")
         opened.append(EvaluatedRun(path, specs, stream_of([path])))
-    refuse_mixed_labels([(run.place, spec) for run in opened for spec in run.specs])
+    named = [(run.place, spec) for run in opened for spec in run.specs]
+    refuse_mixed_labels(named)
+    refuse_sampled_yaw(named)
     return opened
 
 

@@ -54,8 +54,8 @@ OUTCOMES: dict[str, str] = {
 # Outcome of the last execution, where the first failed; the order is part of the data format.
 RETRY_OUTCOMES = ("none", *OUTCOMES)
 
-# Version of all schemas: another one is not read.
-SCHEMA_VERSION = 4
+# Version of all schemas, and the oldest that is read.
+SCHEMA_VERSION, OLDEST_SCHEMA = 5, 4
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ class Field:
     """One array of a store.
 
     `dims` names the axes after the table's own ("scene" or "sample"); `RecordSchema.sizes` has their lengths.
-    `low` and `high` bound every finite value (closed interval).
+    `low` and `high` bound every finite value (closed interval). Stores of a version before `since` lack it:
+    readers compute it (`stored_arrays.COMPUTED`).
     """
 
     name: str
@@ -75,6 +76,7 @@ class Field:
     low: float | None = None
     high: float | None = None
     codes: tuple[str, ...] = ()  # meanings of the values 0, 1, ...
+    since: int = OLDEST_SCHEMA
 
     @property
     def is_text(self) -> bool:
@@ -101,6 +103,13 @@ class RecordSchema:
 
     def shape(self, f: Field, rows: int) -> tuple[int, ...]:
         return (rows, *(self.sizes[d] for d in f.dims))
+
+    def of_version(self, version: int) -> RecordSchema:
+        """The schema as it was in an older version."""
+        if version == self.version:
+            return self
+        scene, sample = (tuple(f for f in self.table(table) if f.since <= version) for table in TABLES)
+        return replace(self, version=version, scene_fields=scene, sample_fields=sample)
 
     def sized(self, **sizes: int) -> RecordSchema:
         """The schema with axis lengths of one specification (points, objects)."""
@@ -187,6 +196,8 @@ SAMPLE_FIELDS = (
     Field("robot_index", "int16", (), "1", "",
           "index of the robot in its scene; candidates of one robot share its numbers", 0),
     Field("base_xy_m", "float32", ("xy",), "m", "world", "base position", -_EXTENT, _EXTENT),
+    Field("base_yaw_rad", "float32", (), "rad", "world",
+          "heading of the base, counter-clockwise from x", -3.1416, 3.1416, since=5),
     Field("camera_height_m", "float32", (), "m", "world", "height of the robot's camera", 0, 10),
     Field("base_height_m", "float32", (), "m", "world", "height of the arm's mount", 0, 10),
     Field("arm_reach_m", "float32", (), "m", "", "reach of the arm, d_arm", 0, 10),
@@ -259,9 +270,13 @@ SCHEMAS: dict[str, RecordSchema] = {
 }
 
 
-def sized_schema(name: str, spec: Specification) -> RecordSchema:
+def sized_schema(name: str, spec: Specification, version: int = SCHEMA_VERSION) -> RecordSchema:
     """Return the named schema with the specification's axis lengths. InputError for an unknown name."""
     if name not in SCHEMAS:
         raise InputError("specification", "label_source", f"no record schema {name!r}", choices(SCHEMAS))
     joints = {} if spec.arm is None or spec.arm.joints is None else {"joint": spec.arm.joints}
-    return SCHEMAS[name].sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter, **joints)
+    return (
+        SCHEMAS[name]
+        .of_version(version)
+        .sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter, **joints)
+    )

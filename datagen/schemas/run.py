@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import SCHEMA_VERSION, RecordSchema, sized_schema
+from datagen.schemas.fields import OLDEST_SCHEMA, SCHEMA_VERSION, RecordSchema, sized_schema
 from datagen.schemas.record_files import (
     MAX_RECORD_BYTES,
     MAX_STACK_CHARS,
@@ -139,11 +139,13 @@ class Run:
     def schema(self) -> RecordSchema:
         """The record schema with the run's axis lengths. InputError for an unknown one."""
         manifest, place = self.manifest, f"{self.storage.url}/manifest.json"
-        if manifest.schema_version != SCHEMA_VERSION:
-            problem = f"is {manifest.schema_version}, but this program reads {SCHEMA_VERSION}"
+        if not OLDEST_SCHEMA <= manifest.schema_version <= SCHEMA_VERSION:
+            problem = (
+                f"is {manifest.schema_version}, but this program reads {OLDEST_SCHEMA} to {SCHEMA_VERSION}"
+            )
             raise InputError(place, "schema_version", problem, "Use the version of datagen that made the run")
         try:
-            return sized_schema(manifest.schema_name, manifest.spec)
+            return sized_schema(manifest.schema_name, manifest.spec, manifest.schema_version)
         except InputError as e:
             raise InputError(place, e.field, e.problem, e.fix) from e
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import SceneRows
+from datagen.schemas.fields import SCHEMAS, SceneRows
 from datagen.schemas.run import Rows, Run
 from datagen.schemas.run_records import Commit
 from datagen.schemas.safe_files import DAMAGED_ZIP
@@ -29,8 +29,11 @@ from datagen.schemas.stored_arrays import (
     Array,
     StoredArray,
     decode_chunk,
+    facing_rad,
     has_crc32c,
     parse_metadata,
+    readable,
+    sources_of,
 )
 
 Wanted = Sequence[tuple[StoredArray, int]]  # chunks, each as its array and its index there
@@ -182,11 +185,18 @@ class ShardPlace:
 
     def read(self, arrays: Iterable[StoredArray]) -> dict[str, Array]:
         """Read the wanted rows of each array. InputError for a missing, foreign or damaged file."""
-        wanted = {array.name: array for array in arrays}
+        asked = list(arrays)
+        wanted = {array.name: array for each in asked for array in each.computed_from or (each,)}
         parts: dict[str, list[Array]] = {name: [] for name in wanted}
         for array, place, data in self.chunks(wanted.values()):
             parts[array.name].append(decode_chunk(place, array, data))
-        return {name: self._joined(array, parts[name]) for name, array in wanted.items()}
+        read = {name: self._joined(array, parts[name]) for name, array in wanted.items()}
+        return {each.name: self._facing(read) if each.computed_from else read[each.name] for each in asked}
+
+    def _facing(self, read: Mapping[str, Array]) -> Array:
+        """Headings that face the target: those of stores without headings."""
+        scene = np.arange(self.samples) // (self.full_samples // self.full_scenes)
+        return facing_rad(read["target_center_m"][scene, :2] - read["base_xy_m"]).astype(np.float32)
 
     def chunks(self, arrays: Iterable[StoredArray]) -> Iterator[tuple[StoredArray, str, bytes]]:
         """Yield the encoded chunks that hold the wanted rows: array, address, bytes."""
@@ -229,7 +239,9 @@ def read_committed(
 ) -> dict[str, Array]:
     """Read rows [all] of the named arrays of a committed shard. InputError as `ShardPlace.read`."""
     place = committed_place(run, commit, rows)
-    return place.read(place.source.metadata(names).values())
+    stored = [f.name for _, f in run.schema.fields]
+    arrays = readable(names, place.source.metadata(sources_of(names, stored)))
+    return place.read(arrays.values())
 
 
 def read_scene(run: Run, scene: int) -> SceneRows:
@@ -244,19 +256,18 @@ def read_scenes(run: Run, scenes: Iterable[int]) -> Iterator[SceneRows]:
     is not committed or damaged.
     """
     per_shard, per_scene = run.layout.scenes_per_shard, run.layout.candidates_per_scene
-    loaded, arrays = -1, dict[str, Array]()
+    schema, loaded, arrays = SCHEMAS[run.schema.name], -1, dict[str, Array]()
     for scene in scenes:
         shard, row = divmod(scene, per_shard)
         if shard != loaded:
             loaded, arrays = shard, read_shard(run, shard)
         rows = np.s_[row * per_scene : (row + 1) * per_scene]
         yield SceneRows(
-            record={f.name: arrays[f.name][row] for f in run.schema.scene_fields},
-            samples={f.name: arrays[f.name][rows] for f in run.schema.sample_fields},
+            record={f.name: arrays[f.name][row] for f in schema.scene_fields},
+            samples={f.name: arrays[f.name][rows] for f in schema.sample_fields},
         )
 
 
 def read_shard(run: Run, shard: int) -> dict[str, Array]:
     """Read all rows of every array of a committed shard. InputError for a missing or damaged file."""
-    names = [f.name for f in (*run.schema.scene_fields, *run.schema.sample_fields)]
-    return read_committed(run, run.commit_of(shard), names)
+    return read_committed(run, run.commit_of(shard), [f.name for _, f in SCHEMAS[run.schema.name].fields])

@@ -10,42 +10,23 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from datagen.schemas.identity import digest_of
+from datagen.schemas.intervals import Corner, Fraction, Frozen, Interval, Metres, Range, Turns
 
 # The reach that Franka Emika states for the Panda.
 PANDA_REACH_M = 0.855
 
-Metres = Annotated[float, Field(ge=0.0, le=100.0, allow_inf_nan=False)]
-Fraction = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
-
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class Source(_Frozen):
+class Source(Frozen):
     """The source of houses or objects: the registry name and a digest of the content."""
 
     kind: str
     digest: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
-class Range(_Frozen):
-    """A closed interval in metres, from which a length is sampled uniformly."""
-
-    low: Metres
-    high: Metres
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Range:
-        if self.high < self.low:
-            raise ValueError(f"high {self.high} is below low {self.low}")
-        return self
-
-
-class SceneParams(_Frozen):
+class SceneParams(Frozen):
     """Choice of support surface, target and clutter."""
 
     n_clutter: int = Field(default=6, ge=0, le=30)
@@ -57,7 +38,7 @@ class SceneParams(_Frozen):
     max_retries: int = Field(default=200, ge=1, le=10_000)
 
 
-class SettleParams(_Frozen):
+class SettleParams(Frozen):
     """Physics until rest."""
 
     engine: str = "sapien"
@@ -71,7 +52,7 @@ class SettleParams(_Frozen):
     max_drop_m: Metres = 0.05
 
 
-class NoiseParams(_Frozen):
+class NoiseParams(Frozen):
     """Stereo-like depth noise; `enabled=False` leaves the frame exact."""
 
     enabled: bool = False
@@ -82,7 +63,7 @@ class NoiseParams(_Frozen):
     hole_rate: Fraction = 0.002
 
 
-class ObservationParams(_Frozen):
+class ObservationParams(Frozen):
     """One RGB-D frame; intrinsics like a RealSense D435 colour stream at 640x480."""
 
     renderer: str = "embree"
@@ -101,8 +82,8 @@ class ObservationParams(_Frozen):
     noise: NoiseParams = NoiseParams()
 
 
-class CandidateParams(_Frozen):
-    """Base positions around the target and their robots (paper, Sec. IV-A)."""
+class CandidateParams(Frozen):
+    """Base poses around the target and their robots (paper, Sec. IV-A)."""
 
     per_scene: Annotated[int, Field(ge=1, le=625)] | Literal["grid"] = 60
     grid_cells: int = Field(default=25, ge=2, le=200)
@@ -120,7 +101,27 @@ class CandidateParams(_Frozen):
     base_radius_m: Metres = 0.25
     # Bases of arms shorter than the Panda are narrower in proportion; None: all alike.
     scaled_base: bool | None = None
+    # Corners of the base around the mount, x ahead, of which the convex hull counts; None: the circle.
+    footprint_m: Annotated[tuple[Corner, ...], Field(strict=False, min_length=3, max_length=100)] | None = (
+        None
+    )
     mast_radius_m: Metres = 0.05
+    # Heading of the base, relative to the direction from it to the target; None: the base faces the target.
+    yaw_rad: Turns | None = None
+
+    @model_validator(mode="after")
+    def _holds_mount(self) -> CandidateParams:
+        if self.footprint_m is not None:
+            x, y = np.array(self.footprint_m).T
+            angle = np.sort(np.arctan2(y, x))
+            if np.diff(angle, append=angle[0] + 2 * np.pi).max() >= np.pi:
+                raise ValueError("footprint_m does not hold the mount, its origin")
+        return self
+
+    @property
+    def samples_yaw(self) -> bool:
+        """Whether headings differ between candidates with one direction to the target."""
+        return self.yaw_rad is not None and self.yaw_rad.low < self.yaw_rad.high
 
     @property
     def count(self) -> int:
@@ -133,7 +134,7 @@ class CandidateParams(_Frozen):
         return self.base_radius_m * share
 
 
-class GraspParams(_Frozen):
+class GraspParams(Frozen):
     """Grasps of the target: the number to search, and the number to look at for all candidates of a scene."""
 
     per_object: int = Field(default=4000, ge=1, le=10_000)
@@ -143,7 +144,7 @@ class GraspParams(_Frozen):
     min_score: Fraction = 0.5
 
 
-class MotionParams(_Frozen):
+class MotionParams(Frozen):
     """The kinematic stage: IK, collisions, path, straight approach and lift."""
 
     ik_seeds: int = Field(default=4, ge=1, le=100)
@@ -163,7 +164,7 @@ class MotionParams(_Frozen):
     margin_m: float = Field(default=0.005, ge=0, le=0.2)
 
 
-class TrialParams(_Frozen):
+class TrialParams(Frozen):
     """Execution in physics: the whole planned path, close, lift, hold."""
 
     timestep_s: float = Field(default=1 / 200, ge=1e-4, le=0.02)
@@ -191,11 +192,7 @@ class TrialParams(_Frozen):
         return self
 
 
-class Interval(Range):
-    """A closed interval, without unit, from which a number is sampled uniformly."""
-
-
-class DisturbanceParams(_Frozen):
+class DisturbanceParams(Frozen):
     """Disturbed labels: the robot arrives near a candidate `repeats` times and plans from there.
 
     It knows its pose, but not the errors of the target's pose, friction and mass, which only trials show.
@@ -217,7 +214,7 @@ class DisturbanceParams(_Frozen):
         return self
 
 
-class ArmParams(_Frozen):
+class ArmParams(Frozen):
     """The arm of the label sources `plan` and `sim`; `trial` is None for `plan`."""
 
     robot: str = "panda-scaled"
@@ -243,19 +240,19 @@ class ArmParams(_Frozen):
         return self.robot if self.robot_digest is None else f"{self.robot}@{self.robot_digest}"
 
 
-class ScenesFrom(_Frozen):
+class ScenesFrom(Frozen):
     """The run whose scenes and candidates are labelled again."""
 
     spec_hash: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
-class VisibilityParams(_Frozen):
+class VisibilityParams(Frozen):
     """Rays of the visibility window (n x n, fitted to the target's bounding sphere)."""
 
     window_px: int = Field(default=64, ge=8, le=512)
 
 
-class HeuristicParams(_Frozen):
+class HeuristicParams(Frozen):
     """The distance-visibility label (paper, Sec. III-B).
 
     The paper gives the weights, the threshold, the distance bounds and the visibility score, but not a, mu,
@@ -279,7 +276,7 @@ class HeuristicParams(_Frozen):
         return self
 
 
-class Specification(_Frozen):
+class Specification(Frozen):
     """All that decides the samples of a run."""
 
     label_source: str = "heuristic"

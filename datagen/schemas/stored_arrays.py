@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -19,9 +19,9 @@ from numcodecs.vlen import VLenUTF8
 from numcodecs.zstd import Zstd
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import RecordSchema
+from datagen.schemas.fields import SAMPLE_FIELDS, RecordSchema
 from datagen.schemas.run_records import Layout
-from datagen.schemas.shard_files import MAX_TEXT_BYTES, chunk_path, group_metadata
+from datagen.schemas.shard_files import MAX_TEXT_BYTES, chunk_path, field_attributes, group_metadata
 
 Array = npt.NDArray[Any]
 
@@ -30,6 +30,9 @@ MAX_DECODED_BYTES = 2**30  # far above any real chunk
 _MAX_PER_FILE = 2**20
 _NUMBERS = {"bool", "float16", "float32", "float64"}
 _NUMBERS |= {f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)}
+# Arrays that stores of older versions lack, and those of which readers compute them (`ShardPlace.read`).
+COMPUTED = {"base_yaw_rad": ("base_xy_m", "target_center_m")}
+_ATTRIBUTES = {field.name: field_attributes(field) for field in SAMPLE_FIELDS if field.name in COMPUTED}
 DAMAGE_FIX = "Restore the file from a copy, or set the shard aside with `datagen verify --repair`"
 
 
@@ -48,6 +51,7 @@ class StoredArray:
     per_file: int
     dims: tuple[str, ...]
     attributes: Mapping[str, Any]
+    computed_from: tuple[StoredArray, ...] = ()  # empty where it is stored
 
     @property
     def is_text(self) -> bool:
@@ -105,6 +109,29 @@ def arrays_of(schema: RecordSchema, layout: Layout) -> Mapping[str, StoredArray]
     files = group_metadata(schema, layout, "")
     paths = {field.name: f"{field.name}/zarr.json" for _, field in schema.fields}
     return {name: parse_metadata(path, name, files[path]) for name, path in paths.items()}
+
+
+def sources_of(names: Iterable[str], stored: Container[str]) -> list[str]:
+    """The arrays to read for the named ones, of which a store may lack some that are computed."""
+    known = ((name,) if name in stored else COMPUTED.get(name, (name,)) for name in names)
+    return list(dict.fromkeys(name for each in known for name in each))
+
+
+def readable(names: Iterable[str], stored: Mapping[str, StoredArray]) -> dict[str, StoredArray]:
+    """The named arrays by name, with what those are computed from that the store lacks."""
+    return {name: stored[name] if name in stored else _computed(name, stored) for name in names}
+
+
+def _computed(name: str, stored: Mapping[str, StoredArray]) -> StoredArray:
+    sources = tuple(stored[source] for source in COMPUTED[name])
+    first = sources[0]
+    like = replace(first, name=name, shape=first.shape[:1], dims=first.dims[:1], attributes=_ATTRIBUTES[name])
+    return replace(like, computed_from=sources)
+
+
+def facing_rad(towards_m: Array) -> npt.NDArray[np.float64]:
+    """Headings (...,) along vectors (..., 2), counter-clockwise from x."""
+    return np.arctan2(towards_m[..., 1], towards_m[..., 0], dtype=np.float64)
 
 
 def decode_chunk(place: str, array: StoredArray, data: bytes) -> Array:

@@ -66,10 +66,7 @@ _DERIVED: Mapping[str, tuple[tuple[str, ...], Callable[[_Rows], Array]]] = {
     "robot": ((), _Rows.robot),
     "base_x_world_m": (("base_xy_m",), lambda rows: rows.stored("base_xy_m")[:, 0]),
     "base_y_world_m": (("base_xy_m",), lambda rows: rows.stored("base_xy_m")[:, 1]),
-    "base_yaw_world_rad": (
-        ("base_xy_m", "target_center_m"),
-        lambda rows: np.arctan2(-rows.from_target(1), -rows.from_target(0)),
-    ),
+    "base_yaw_world_rad": (("base_yaw_rad",), lambda rows: rows.stored("base_yaw_rad")),
     "base_x_target_m": (("base_xy_m", "target_center_m"), lambda rows: rows.from_target(0)),
     "base_y_target_m": (("base_xy_m", "target_center_m"), lambda rows: rows.from_target(1)),
     "target_x_world_m": (("target_center_m",), lambda rows: rows.stored("target_center_m")[:, 0]),
@@ -96,8 +93,8 @@ def candidates(
 ) -> pandas.DataFrame:
     """Return a pandas table with one row per candidate base pose, joined with its scene.
 
-    The base is at `base_x_world_m`, `base_y_world_m` in the frame of the house (z up, floor at 0) and
-    faces the target: `base_yaw_world_rad`, counter-clockwise from x. `base_x_target_m` and
+    The base is at `base_x_world_m`, `base_y_world_m` in the frame of the house (z up, floor at 0) with the
+    heading `base_yaw_world_rad`, counter-clockwise from x. `base_x_target_m` and
     `base_y_target_m` are along the same axes, from the target's centre. `cost_s` is the wall-clock time
     of the candidate's shard divided by its candidates (unknown for a sealed store without its run).
     `robot` is empty where labels have no particular arm. `split` is the side of the train, val, test

@@ -20,11 +20,11 @@ def fields_of(paths: Sequence[str | Path], function: str) -> list[dict[str, tupl
 
 def _fields_of(path: str | Path) -> dict[str, tuple[Table, Field]]:
     if is_sealed_store(path):
-        sealed = open_sealed(path, ("scene_index", "sample_scene_index"))
-        schema = SCHEMAS[sealed.schema]
+        name = open_sealed(path, ("scene_index", "sample_scene_index")).schema
     else:
-        schema = open_runs(str(path))[0].schema
-    return {field.name: (table, field) for table, field in schema.fields}
+        name = open_runs(str(path))[0].schema.name
+    # Readers compute what stores of older versions lack.
+    return {field.name: (table, field) for table, field in SCHEMAS[name].fields}
 
 
 def refuse_unknown(names: Sequence[str], valid: Sequence[str], place: str) -> None:

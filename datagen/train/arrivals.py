@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +47,12 @@ class Arrival:
     def distance_m(self) -> float:
         """Root mean square distance of the arrivals from the goal."""
         return float(np.sqrt(np.mean((self.offsets[:, :2] ** 2).sum(axis=1))))
+
+    def turned(self, yaw_rad: float) -> Arrival:
+        """The same errors as seen from a goal that faces the target, for one with another heading to it."""
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        return replace(self, offsets=self.offsets @ turn) if yaw_rad and not self.is_round else self
 
     def drawn(self, n: int, rng: np.random.Generator) -> F64:
         """`n` of the errors (n, 3), evenly spaced from a random start, so that a few still differ.

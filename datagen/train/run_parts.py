@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from datagen.schemas.errors import InputError, choices
-from datagen.schemas.fields import SCHEMA_VERSION, SCHEMAS
+from datagen.schemas.fields import OLDEST_SCHEMA, SCHEMA_VERSION, SCHEMAS
 from datagen.schemas.record_files import MERGED
 from datagen.schemas.run import Rows, Run, open_runs
 from datagen.schemas.run_records import Layout
 from datagen.schemas.shard_reading import ShardPlace, StoreFiles, committed_place
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
-from datagen.schemas.stored_arrays import MAX_META_BYTES, StoredArray, arrays_of
+from datagen.schemas.stored_arrays import MAX_META_BYTES, StoredArray, arrays_of, readable, sources_of
 
 _SEALED_FIX = "Seal the run again, and copy the whole data.zarr"
 
@@ -96,7 +96,7 @@ def _open(path: Path | str, names: Sequence[str], allow_incomplete: bool) -> lis
 def _open_run(run: Run, merged: str, names: Sequence[str], allow_incomplete: bool) -> RunPart | None:
     n, url = run.n, run.storage.url
     stored = arrays_of(run.schema, run.layout)
-    _refuse_unknown(url, names, list(stored))
+    _refuse_unknown(url, sources_of(names, stored), list(stored))
     planned, shards = run.planned(n), list[ShardPlace]()
     cost = {"wall_s": 0.0, "cpu_s": 0.0}
     for commit in run.commits():
@@ -114,7 +114,7 @@ def _open_run(run: Run, merged: str, names: Sequence[str], allow_incomplete: boo
         return None
     manifest = run.manifest
     version = manifest.schema_version
-    specs, arrays = (manifest.spec,), {name: stored[name] for name in names}
+    specs, arrays = (manifest.spec,), readable(names, stored)
     hashes, schema, sources = (manifest.spec_hash,), manifest.schema_name, (manifest.sources,)
     return RunPart(url, hashes, specs, schema, version, shards, arrays, cost, sources, {}, merged)
 
@@ -152,12 +152,14 @@ def open_sealed(path: Path | str, names: Sequence[str]) -> RunPart:
         specs = tuple(Specification.model_validate_json(json.dumps(part["specification"])) for part in runs)
     except (ValueError, KeyError, TypeError, RecursionError) as e:
         raise InputError(where, "", f"is not the root of a sealed store ({e})", _SEALED_FIX) from e
-    if schema not in SCHEMAS or version != SCHEMA_VERSION:
-        problem = f"is {schema!r} {version}, but this program reads {', '.join(SCHEMAS)} {SCHEMA_VERSION}"
+    if schema not in SCHEMAS or not OLDEST_SCHEMA <= version <= SCHEMA_VERSION:
+        readable_here = f"{', '.join(SCHEMAS)} {OLDEST_SCHEMA} to {SCHEMA_VERSION}"
+        problem = f"is {schema!r} {version}, but this program reads {readable_here}"
         raise InputError(where, "schema_version", problem, "Use the version of datagen that made the run")
-    _refuse_unknown(storage.url, names, stored)
+    needed = sources_of(names, stored)
+    _refuse_unknown(storage.url, needed, stored)
     source = StoreFiles(storage)
-    arrays = source.metadata(names)
+    arrays = readable(names, source.metadata(needed))
     scenes = {a.shape[0] for a in arrays.values() if a.dims[0] == "scene"}
     samples = {a.shape[0] for a in arrays.values() if a.dims[0] == "sample"}
     if len(scenes) != 1 or len(samples) != 1:
@@ -174,6 +176,14 @@ def open_sealed(path: Path | str, names: Sequence[str]) -> RunPart:
     ]
     sources = tuple({} for _ in specs)
     return RunPart(str(path), spec_hashes, specs, schema, version, slices, arrays, None, sources, attributes)
+
+
+def refuse_sampled_yaw(parts: Iterable[tuple[str, Specification]]) -> None:
+    """Raise InputError where a run, (path, specification), samples headings: no model has one as an input."""
+    for place, spec in parts:
+        if spec.candidates.samples_yaw:
+            problem = "headings of the base are sampled, and no model has them as an input yet"
+            raise InputError(place, "candidates.yaw_rad", problem, "Use runs with one heading to the target")
 
 
 def refuse_mixed_labels(parts: Sequence[tuple[str, Specification]]) -> None:

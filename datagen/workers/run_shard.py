@@ -146,6 +146,7 @@ def candidate_columns(
         "candidate_index": index,
         "robot_index": candidates.robot_index,
         "base_xy_m": candidates.base_xy_m,
+        "base_yaw_rad": candidates.base_yaw_rad,
         "camera_height_m": candidates.camera_height_m,
         "base_height_m": candidates.base_height_m,
         "arm_reach_m": candidates.arm_reach_m,

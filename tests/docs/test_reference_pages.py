@@ -16,6 +16,7 @@ from datagen.schemas.specification import (
     Source,
     Specification,
     TrialParams,
+    Turns,
 )
 from scripts import data_format_page, specification_page
 from tests.conftest import REPOSITORY
@@ -59,4 +60,7 @@ def test_the_example_of_a_specification_has_the_defaults_also_where_it_comments_
     spec = Specification.model_validate(SOURCES | fields)
     assert spec.arm == ArmParams(trial=TrialParams(), disturbance=DisturbanceParams())
     assert set(fields["arm"]) == set(ArmParams.model_fields) - {"robot_digest", "joints"}
-    assert spec.candidates == CandidateParams(within="clear", scaled_base=True)
+    corners = ((0.3, 0.2), (-0.3, 0.2), (-0.3, -0.2), (0.3, -0.2))
+    turns = Turns(low=-0.5, high=0.5)
+    absent = {"within": "clear", "scaled_base": True, "footprint_m": corners, "yaw_rad": turns}
+    assert spec.candidates == CandidateParams(**absent)

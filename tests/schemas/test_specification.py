@@ -39,6 +39,11 @@ NONSENSE: tuple[dict[str, Any], ...] = (  # what test_bad_input.py does not give
     {"arm": {"trial": {"timestep_s": 0.02, "control_period_s": 0.01}}},
     {"arm": {"motion": {"check_step_rad": 1e-300}}}, {"arm": {"motion": {"lift_m": 0}}},
     {"arm": {"motion": {"lift_m": 100}}}, {"arm": {"motion": {"pregrasp_m": 100}}},
+    {"candidates": {"yaw_rad": {"low": 0.2, "high": 0.1}}},
+    {"candidates": {"yaw_rad": {"low": -4.0, "high": 0.0}}},
+    {"candidates": {"footprint_m": [[1, 1], [1, -1], [2, 0]]}},
+    {"candidates": {"footprint_m": [[1, 0], [-1, 0]]}},
+    {"candidates": {"footprint_m": [[1, 0], [0, 0], [-1, 0]]}},
     {"arm": {"motion": {"margin_m": 100}}}, {"arm": {"disturbance": {"mass_scale": {"low": 0, "high": 1}}}},
 )  # fmt: skip
 

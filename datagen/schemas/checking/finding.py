@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
@@ -96,10 +97,25 @@ def read(
         record = decode_record(key, data, model)
     except InputError as error:
         return Read(key, data, None, f"{error.field}: {error.problem}" if error.field else error.problem)
-    if signed_json(record.model_dump(mode="json")) != data:
+    if not _has_form(data, record):
         return Read(key, data, None, "signed, but not in the form that datagen writes")
     problem = refuse(record)
     return Read(key, data, None if problem else record, problem)
+
+
+def _has_form(data: bytes, record: BaseModel) -> bool:
+    """Whether a record's bytes are those of this or an older version, which lacks newer empty keys."""
+    fields = json.loads(data)
+    del fields["sha256"]
+    known = record.model_dump(mode="json")
+    return signed_json(fields) == data and json.dumps(_filled(fields)) == json.dumps(_filled(known))
+
+
+def _filled(value: Any) -> Any:
+    """A JSON value without the keys of empty ones."""
+    if isinstance(value, dict):
+        return {key: _filled(each) for key, each in value.items() if each is not None}
+    return [_filled(each) for each in value] if isinstance(value, list) else value
 
 
 def compare(

@@ -10,6 +10,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from datagen.schemas.specification import CandidateParams
+from datagen.schemas.stored_arrays import facing_rad
 from datagen.train.arrivals import Arrival, expected_success, stands, tolerance_m
 from datagen.train.inputs import F32, F64, I64, Bools
 from datagen.train.prediction.floor_ways import CELL_M, WAYS, counted, draw_map, ways_to
@@ -40,6 +41,7 @@ class RobotSize:
     base_height_m: float
     arm_reach_m: float
     footprint: Footprint | None = None  # None: the circular base of such an arm in runs
+    yaw_rad: float = 0.0  # heading of the base relative to the direction to the target
 
     @property
     def outline(self) -> Footprint:
@@ -58,10 +60,10 @@ class BaseCells:
     way: I64  # (N,), index into WAYS: how the base gets there from the camera
 
 
-def yaws_to_target(offset_m: F32) -> F64:
-    """Headings (N,) that face the target from offsets (N, 2), counter-clockwise from x."""
-    x, y = -offset_m.astype(np.float64).T
-    return np.arctan2(y, x)
+def headings(offset_m: F32, robot: RobotSize) -> F64:
+    """Headings (N,) of a robot at offsets (N, 2) from the target, counter-clockwise from x."""
+    yaw_rad = facing_rad(-offset_m.astype(np.float64))
+    return (yaw_rad + robot.yaw_rad + np.pi) % (2 * np.pi) - np.pi if robot.yaw_rad else yaw_rad
 
 
 def observe_cells(
@@ -75,7 +77,7 @@ def observe_cells(
     seen. A polygon must also fit where the base turns up to twice `yaw_error_rad` too far.
     """
     offsets, base = grid_offsets(params), robot.outline
-    base_xy, yaw = center_m[:2] + offsets, yaws_to_target(offsets.astype(np.float32))
+    base_xy, yaw = center_m[:2] + offsets, headings(offsets.astype(np.float32), robot)
     z = seen.points_m[:, 2]
     gap_m = np.min([distances_m(seen.points_m, eye) for eye in seen.eyes_m], axis=0)
     is_floor = np.any([floor_points(seen.points_m, eye) for eye in seen.eyes_m], axis=0)

@@ -83,11 +83,13 @@ def read_footprint(given: str | float | Sequence[Sequence[float]] | Footprint) -
     if not isinstance(given, str):
         return circle_footprint(given) if isinstance(given, (int, float)) else polygon_footprint(given)
     if given in ROBOTS or given.endswith(".toml"):
-        corners_m = robot_limits(given).footprint_m
-        if corners_m is None:
+        limits = robot_limits(given)
+        if limits.polygon_m is not None:
+            return polygon_footprint(limits.polygon_m)
+        if limits.base_radius_m is None:
             problem = "stands on a pedestal: its file has no base"
             raise InputError("--footprint", given, problem, "Give the radius or the corners of its base")
-        return polygon_footprint(corners_m)
+        return circle_footprint(limits.base_radius_m)
     try:
         rows = [[float(c) for c in corner.split(",")] for corner in given.split(";") if corner.strip()]
     except ValueError:

@@ -22,9 +22,9 @@ from datagen.train.prediction.base_cells import (
     Choice,
     RobotSize,
     choose,
+    headings,
     observe_cells,
     seen_share,
-    yaws_to_target,
 )
 from datagen.train.prediction.frames import SensorFrame, image_frame
 from datagen.train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
@@ -76,11 +76,11 @@ class Prediction:
 
     @property
     def yaw_rad(self) -> F64:
-        """Headings (N,) that face the target, counter-clockwise from x."""
-        return yaws_to_target(self.cells.offset_m)
+        """Headings (N,), counter-clockwise from x: towards the target, or with the robot's side to it."""
+        return headings(self.cells.offset_m, self.robot)
 
     def T_world_base(self, row: int) -> F64:
-        """Pose (4, 4) of the arm's mount at one base pose: at base height, x towards the target."""
+        """Pose (4, 4) of the arm's mount at one base pose: at base height, x to the front of the base."""
         x, y = self.base_xy_m[row]
         return yaw_pose(float(x), float(y), self.robot.base_height_m, float(self.yaw_rad[row]))
 
@@ -218,7 +218,8 @@ def predict(
     cells = observe_cells(seen, centre, robot, _grid(grid, half_width_m), yaw_rad)
     score = scored(scorer, _batch(cloud, target, robot, cells))
     allowed = (CLEAR, UNSEEN) if allow_unseen else (CLEAR,)
-    choice = choose(score, cells, allowed, scorer.threshold, arrival)
+    seen_from_goal = None if arrival is None else arrival.turned(robot.yaw_rad)
+    choice = choose(score, cells, allowed, scorer.threshold, seen_from_goal)
     notes = (*_notes(grounds, filled, cloud), *robot_notes(scorer, robot))
     given = (scorer.name, robot, tuple(frames), tuple(grounds))
     return Prediction(*given, seen, target, filled, cloud, cells, score, choice, arrival, notes)

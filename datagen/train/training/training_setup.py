@@ -20,7 +20,7 @@ from datagen.train.encoded_runs import EncodedBatches, encode_runs, encoded_stre
 from datagen.train.models import Model, build_model
 from datagen.train.models.shared import SharedModel
 from datagen.train.rates import rate_fields
-from datagen.train.run_parts import open_parts, refuse_mixed_labels
+from datagen.train.run_parts import open_parts, refuse_mixed_labels, refuse_sampled_yaw
 from datagen.train.splits import HouseShare, refuse_one_class, refuse_shared_houses, split_by_house
 from datagen.train.training.checkpoints import (
     Checkpoint,
@@ -164,7 +164,9 @@ def _streams(job: TrainingJob) -> tuple[SampleStream, SampleStream]:
     for stream in (train, val):
         _refuse_other_labels(options.stage, stream)
     parts = [summary.part for stream in (train, val) for summary in stream.parts]
-    refuse_mixed_labels([(part.place, spec) for part in parts for spec in part.specs])
+    named = [(part.place, spec) for part in parts for spec in part.specs]
+    refuse_mixed_labels(named)
+    refuse_sampled_yaw(named)
     refuse_shared_houses(train, val)
     return train, val
 

@@ -8,7 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.specification import CandidateParams, Range
+from datagen.schemas.stored_arrays import facing_rad
 from datagen.workers.bases.clearance import (
+    Footprint,
     ObstacleDistances,
     Obstacles,
     base_clearance_m,
@@ -29,6 +31,7 @@ class SceneCandidates:
     """N base poses of one scene. Numbers are float32, as stored, so that labels can be recomputed."""
 
     base_xy_m: F32  # (N, 2), world
+    base_yaw_rad: F32  # (N,), heading of the base, world
     robot_index: npt.NDArray[np.int16]  # (N,)
     camera_height_m: F32  # (N,)
     base_height_m: F32  # (N,)
@@ -70,6 +73,11 @@ def grid_offsets(params: CandidateParams) -> F64:
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
+def footprint_of(params: CandidateParams) -> Footprint | None:
+    """The polygon of the bases; None where they are circles."""
+    return None if params.footprint_m is None else Footprint(params.footprint_m)
+
+
 def draw_candidates(
     target_center_m: F64, obstacles: Obstacles, params: CandidateParams, rng: np.random.Generator
 ) -> SceneCandidates | None:
@@ -77,7 +85,7 @@ def draw_candidates(
 
     Cells are sampled from all without repetition, or from the set `within`. Candidates are assigned in turn
     to `robots_per_scene` robots, so that a model encodes a scene once per robot; or each has its own robot,
-    as in the paper.
+    as in the paper. Headings are relative to the direction to the target, and sampled last.
 
     With `within`, robots are sampled from their ranges one after another. A robot is kept if each of its
     candidates finds a position in the set; its sizes are then distributed as in the ranges, given that this
@@ -90,19 +98,22 @@ def draw_candidates(
     robot_index = (np.arange(n) % n_robots).astype(np.int16)
     if params.within is None:
         base_xy_m = (target_center_m[:2] + _offsets(params, rng)).astype(np.float32)
-        return _with_clearance(base_xy_m, robot_index, _draw_robots(params, n_robots, rng), obstacles, params)
+        robots = _draw_robots(params, n_robots, rng)
+        yaw_rad = _headings(base_xy_m, target_center_m, params, rng)
+        return _with_clearance(base_xy_m, yaw_rad, robot_index, robots, obstacles, params)
     drawn = _draw_robots(params, DRAWS_A_ROBOT * n_robots, rng)
     rounds = _Rounds(target_center_m, obstacles, params, rng)
-    base_xy_m = np.empty((n, 2), np.float32)
+    rows = np.empty(n, np.int64)
     kept: list[int] = []
     for robot in range(len(drawn)):
         own = robot_index == len(kept)
         found = rounds.take(drawn, robot, int(own.sum()))
         if found is not None:
-            base_xy_m[own] = found
+            rows[own] = found
             kept.append(robot)
             if len(kept) == n_robots:
-                return _with_clearance(base_xy_m, robot_index, drawn.rows(kept), obstacles, params)
+                poses = rounds.xy_m[rows], rounds.yaw_rad[rows]
+                return _with_clearance(*poses, robot_index, drawn.rows(kept), obstacles, params)
     return None
 
 
@@ -132,6 +143,16 @@ def _jittered(offsets_m: F64, params: CandidateParams, rng: np.random.Generator)
     return offsets_m + rng.uniform(-cell / 2, cell / 2, size=offsets_m.shape)
 
 
+def _headings(base_xy_m: F32, target_center_m: F64, params: CandidateParams, rng: np.random.Generator) -> F32:
+    """Headings (N,) in the world at positions (N, 2); random numbers are used only where they are sampled."""
+    yaw_rad = facing_rad(target_center_m[:2] - base_xy_m)
+    if params.yaw_rad is not None:
+        low, high = params.yaw_rad.low, params.yaw_rad.high
+        turned = yaw_rad + (rng.uniform(low, high, len(yaw_rad)) if params.samples_yaw else low)
+        yaw_rad = (turned + np.pi) % (2 * np.pi) - np.pi
+    return yaw_rad.astype(np.float32)
+
+
 def _draw_robots(params: CandidateParams, n: int, rng: np.random.Generator) -> _SceneRobots:
     def draw(r: Range) -> F32:
         return rng.uniform(r.low, r.high, size=n).astype(np.float32)
@@ -151,17 +172,21 @@ def _stepped(reach_m: F32, params: CandidateParams) -> F32:
 
 def _with_clearance(
     base_xy_m: F32,
+    yaw_rad: F32,
     robot_index: npt.NDArray[np.int16],
     robots: _SceneRobots,
     obstacles: Obstacles,
     params: CandidateParams,
 ) -> SceneCandidates:
-    """SceneCandidates of robots at positions (N, 2), world, with their clearance."""
+    """SceneCandidates of robots at positions (N, 2) and headings (N,), world, with their clearance."""
     camera_m, base_m = robots.camera_height_m[robot_index], robots.base_height_m[robot_index]
     reach_m = robots.arm_reach_m[robot_index]
     radius_m = params.radius_of_base_m(reach_m)
-    clearance_m = base_clearance_m(base_xy_m, base_m, camera_m, radius_m, obstacles, params.mast_radius_m)
-    return SceneCandidates(base_xy_m, robot_index, camera_m, base_m, reach_m, clearance_m)
+    outline = footprint_of(params), yaw_rad
+    clearance_m = base_clearance_m(
+        base_xy_m, base_m, camera_m, radius_m, obstacles, params.mast_radius_m, *outline
+    )
+    return SceneCandidates(base_xy_m, yaw_rad, robot_index, camera_m, base_m, reach_m, clearance_m)
 
 
 class _Rounds:
@@ -179,54 +204,71 @@ class _Rounds:
         self._n_cells = len(cells)
         # The cells of all rounds, one round after the other.
         self._cell = np.concatenate([rng.permutation(len(cells)) for _ in range(ROUNDS)])
-        self._xy_m = (target_center_m[:2] + _jittered(cells[self._cell], params, rng)).astype(np.float32)
+        self.xy_m = (target_center_m[:2] + _jittered(cells[self._cell], params, rng)).astype(np.float32)
+        self.yaw_rad = _headings(self.xy_m, target_center_m, params, rng)
+        self._footprint = footprint_of(params)
         self._free = np.ones(len(self._cell), np.bool_)
         # Largest distance between two positions in one cell.
         step_m = 2 * params.grid_half_width_m / (params.grid_cells - 1)
         self._apart_m = np.sqrt(2.0) * step_m if params.jitter else 0.0
         # Rows of the first round with a position in the cell that the longest arm reaches; all for "clear".
-        first_m = self._xy_m[: len(cells)].astype(np.float64) - target_center_m[:2]
+        first_m = self.xy_m[: len(cells)].astype(np.float64) - target_center_m[:2]
         far_m = np.inf if params.within == "clear" else params.arm_reach_m.high + self._apart_m
         self._first = np.flatnonzero(np.linalg.norm(first_m, axis=1) <= far_m)
-        self._around = self._distances(self._xy_m[self._first])
-        # Only part of a cell may be indoors.
-        self._unbounded = replace(self._around, indoors=np.ones_like(self._around.indoors))
+        self._around = self._distances(self._first)
+        # Only part of a cell may be indoors; a base at any heading holds the inner circle of its polygon.
+        self._unbounded = replace(self._around, indoors=np.ones_like(self._around.indoors), base_m=None)
 
-    def take(self, robots: _SceneRobots, robot: int, n: int) -> F32 | None:
-        """Positions (n, 2), world, for a robot, now marked as used; None if fewer are free and in the set."""
+    def take(self, robots: _SceneRobots, robot: int, n: int) -> npt.NDArray[np.int64] | None:
+        """Rows (n,) of poses for a robot, now marked as used; None if fewer are free and in the set."""
         rows = self._first
-        margin_m = self._margins_m(self._xy_m[rows], self._around, robots, robot)
+        radius_m = self._params.radius_of_base_m(robots.arm_reach_m[robot])
+        margin_m = self._margins_m(rows, self._around, robots, robot, radius_m)
         found = rows[(margin_m >= 0) & self._free[rows]]
         if len(found) < n:
             # Within a cell, clearance and distance differ by at most the distance between positions.
             is_possible = np.zeros(self._n_cells, np.bool_)
-            anywhere_m = self._margins_m(self._xy_m[rows], self._unbounded, robots, robot)
+            least_m = radius_m if self._footprint is None else self._footprint.inner_m
+            anywhere_m = self._margins_m(rows, self._unbounded, robots, robot, least_m)
             is_possible[self._cell[rows[anywhere_m >= -self._apart_m]]] = True
             later = self._n_cells + np.flatnonzero(is_possible[self._cell[self._n_cells :]])
             if len(found) + len(later) < n:
                 return None
-            xy_m = self._xy_m[later]
-            margin_m = self._margins_m(xy_m, self._distances(xy_m), robots, robot)
+            margin_m = self._margins_m(later, self._distances(later), robots, robot, radius_m)
             found = np.concatenate([found, later[(margin_m >= 0) & self._free[later]]])
         if len(found) < n:
             return None
         self._free[found[:n]] = False
-        return self._xy_m[found[:n]]
+        return found[:n]
 
-    def _distances(self, xy_m: F32) -> ObstacleDistances:
-        params = self._params
+    def _distances(self, rows: npt.NDArray[np.int64]) -> ObstacleDistances:
+        params, footprint = self._params, self._footprint
         # Heights of robots are rounded to float32.
         highest_m = max(params.camera_height_m.high, params.base_height_m.high) + 1e-3
-        around_m = max(params.base_radius_m, params.mast_radius_m)
-        return distances_from_obstacles(xy_m.astype(np.float64), self._obstacles, highest_m, around_m)
+        around_m = max(footprint.outer_m if footprint else params.base_radius_m, params.mast_radius_m)
+        return distances_from_obstacles(
+            self.xy_m[rows].astype(np.float64),
+            self._obstacles,
+            highest_m,
+            around_m,
+            footprint,
+            self.yaw_rad[rows],
+            params.base_height_m.low - 1e-3,
+        )
 
-    def _margins_m(self, xy_m: F32, around: ObstacleDistances, robots: _SceneRobots, robot: int) -> F32:
+    def _margins_m(
+        self,
+        rows: npt.NDArray[np.int64],
+        around: ObstacleDistances,
+        robots: _SceneRobots,
+        robot: int,
+        radius_m: F64 | np.float64,
+    ) -> F32:
         """The smaller of clearance and remaining reach (N,); not negative for positions in the set."""
         camera_m, mount_m, reach_m = (
             column[robot] for column in (robots.camera_height_m, robots.base_height_m, robots.arm_reach_m)
         )
-        radius_m = self._params.radius_of_base_m(reach_m)
         margin_m = around.clearance_m(mount_m, camera_m, radius_m, self._params.mast_radius_m)
         if self._params.within == "clear":
             return margin_m
-        return np.minimum(margin_m, reach_m - _distances(xy_m, mount_m, self._target_m)[1])
+        return np.minimum(margin_m, reach_m - _distances(self.xy_m[rows], mount_m, self._target_m)[1])

@@ -10,7 +10,10 @@ import numpy.typing as npt
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.planar import (
     convex_hull,
+    following,
     inside_any,
+    polygons_at,
+    signed_distances_between,
     signed_distances_to_convex,
     stack_polygons,
 )
@@ -21,6 +24,7 @@ STEP_M = 0.02
 # Clearances are capped at this: only the neighbourhood is checked.
 FAR_M = 1.0
 _BLOCK = 64  # footprints per block; bounds memory
+_PAIRS = 4096  # of bases and obstacles, likewise
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +49,42 @@ def obstacles_of(house: House) -> Obstacles:
     )
 
 
+class Footprint:
+    """The outline of a base around its mount, x ahead: the convex hull of corners (K, 2)."""
+
+    def __init__(self, corners_m: npt.ArrayLike) -> None:
+        self.polygon_m = convex_hull(np.asarray(corners_m, np.float64))
+        self.outer_m = float(np.linalg.norm(self.polygon_m, axis=1).max())
+        along = following(self.polygon_m) - self.polygon_m
+        aside = along[:, 1] * self.polygon_m[:, 0] - along[:, 0] * self.polygon_m[:, 1]
+        # Radius of the circle around the mount that it holds.
+        self.inner_m = np.float64((aside / np.linalg.norm(along, axis=1)).min())
+
+    def holds(self, corners_m: npt.ArrayLike | None, radius_m: float, slack_m: float) -> bool:
+        """Whether a base with these corners (K, 2), or without corners this circle, lies in it."""
+        if corners_m is None:
+            return bool(self.inner_m >= radius_m - slack_m)
+        found = signed_distances_to_convex(np.asarray(corners_m, np.float64), self.polygon_m[None])
+        return bool((found <= slack_m).all())
+
+    def distances_m(
+        self, xy_m: F64, yaw_rad: F64, polygons_m: F64, distance_m: F64, counts: npt.NDArray[np.bool_]
+    ) -> F64:
+        """Distances (N, P) of the base at poses (N, 2), (N,) from obstacles (P, K, 2); negative: how deep.
+
+        `distance_m` (N, P) are those of the mount. Where another obstacle that `counts` (P,) is nearer for
+        sure, or `FAR_M` is, they are only lower bounds.
+        """
+        found = distance_m - self.outer_m
+        nearest = (distance_m[:, counts] - self.inner_m).min(1, initial=FAR_M)
+        pose, obstacle = np.nonzero(found <= nearest[:, None])
+        at = polygons_at(self.polygon_m, xy_m, yaw_rad)
+        for start in range(0, len(pose), _PAIRS):
+            rows = pose[start : start + _PAIRS], obstacle[start : start + _PAIRS]
+            found[rows] = signed_distances_between(at[rows[0]], polygons_m[rows[1]])
+        return found
+
+
 @dataclass(frozen=True, eq=False)
 class ObstacleDistances:
     """Distances of N positions from the obstacles around them, computed once for robots of any size."""
@@ -53,6 +93,7 @@ class ObstacleDistances:
     low_m: F64  # (P,)
     high_m: F64  # (P,)
     indoors: npt.NDArray[np.bool_]  # (N,)
+    base_m: F64 | None = None  # (N, P), of a base's polygon; None where bases are circles
 
     def clearance_m(
         self,
@@ -67,7 +108,8 @@ class ObstacleDistances:
             for size in (base_height_m, camera_height_m, base_radius_m)
         )
         top_m = np.maximum(camera_m, mount_m)
-        around_base = np.where(self.low_m < mount_m, self.distance_m - base_m, FAR_M)
+        from_base = self.distance_m - base_m if self.base_m is None else self.base_m
+        around_base = np.where(self.low_m < mount_m, from_base, FAR_M)
         hits_mast = (self.low_m < top_m) & (self.high_m > mount_m)
         around_mast = np.where(hits_mast, self.distance_m - mast_radius_m, FAR_M)
         clearance = np.minimum(around_base, around_mast).min(1, initial=FAR_M)
@@ -76,11 +118,18 @@ class ObstacleDistances:
 
 
 def distances_from_obstacles(
-    xy_m: F64, obstacles: Obstacles, highest_m: float, around_m: float
+    xy_m: F64,
+    obstacles: Obstacles,
+    highest_m: float,
+    around_m: float,
+    footprint: Footprint | None = None,
+    yaw_rad: F32 | None = None,
+    lowest_mount_m: float = 0.0,
 ) -> ObstacleDistances:
     """Distances of positions (N, 2), world, from obstacles that begin below `highest_m`.
 
-    Obstacles farther than `around_m` from all positions may be left out.
+    Obstacles farther than `around_m` from all positions may be left out. A `footprint` has headings (N,), and
+    mounts from `lowest_mount_m` on.
     """
     near = (obstacles.polygons_m.max(1) > xy_m.min(0) - around_m).all(1)
     near &= (obstacles.polygons_m.min(1) < xy_m.max(0) + around_m).all(1)
@@ -91,8 +140,11 @@ def distances_from_obstacles(
         for start in range(0, len(rows), _BLOCK)
     )
     distance_m = np.concatenate([np.empty((len(xy_m), 0)), *blocks], axis=1)
-    indoors = inside_any(xy_m, obstacles.floors_m)
-    return ObstacleDistances(distance_m, obstacles.low_m[rows], obstacles.high_m[rows], indoors)
+    indoors, low_m, base_m = inside_any(xy_m, obstacles.floors_m), obstacles.low_m[rows], None
+    if footprint is not None and yaw_rad is not None:
+        heading, counts = yaw_rad.astype(np.float64), low_m < lowest_mount_m
+        base_m = footprint.distances_m(xy_m, heading, obstacles.polygons_m[rows], distance_m, counts)
+    return ObstacleDistances(distance_m, low_m, obstacles.high_m[rows], indoors, base_m)
 
 
 def base_clearance_m(
@@ -102,15 +154,21 @@ def base_clearance_m(
     base_radius_m: F64,
     obstacles: Obstacles,
     mast_radius_m: float,
+    footprint: Footprint | None = None,
+    yaw_rad: F32 | None = None,
 ) -> F32:
     """Clearance (N,) of robots' bodies (m); negative inside an obstacle or outside every room.
 
     Robot k is at `base_xy_m` (N, 2), world, with its arm's mount and its camera at the heights
         (N,). Its body is a cylinder of `base_radius_m` (N,) from the floor to the mount and a mast of
         `mast_radius_m` from there to the camera. An obstacle counts against the cylinder where it
-        begins below the mount, and against the mast where it lies between mount and camera.
+        begins below the mount, and against the mast where it lies between mount and camera. With a
+        `footprint` the body is a prism with this outline at headings (N,), in place of the cylinder.
     """
     top_m = float(np.maximum(camera_height_m, base_height_m).max())
-    around_m = FAR_M + max(float(base_radius_m.max()), mast_radius_m)
-    around = distances_from_obstacles(base_xy_m.astype(np.float64), obstacles, top_m, around_m)
+    outer_m = float(base_radius_m.max()) if footprint is None else footprint.outer_m
+    around_m, lowest_m = FAR_M + max(outer_m, mast_radius_m), float(base_height_m.min())
+    around = distances_from_obstacles(
+        base_xy_m.astype(np.float64), obstacles, top_m, around_m, footprint, yaw_rad, lowest_m
+    )
     return around.clearance_m(base_height_m, camera_height_m, base_radius_m, mast_radius_m)

@@ -79,6 +79,55 @@ def _signed_distances(points_m: F64, polygons_m: F64) -> F64:
     return np.where(left & (area > 1e-12), -border, border)
 
 
+def polygons_at(polygon_m: F64, xy_m: F64, yaw_rad: F64) -> F64:
+    """A polygon (K, 2) with its origin at positions (N, 2), turned counter-clockwise by (N,): (N, K, 2)."""
+    (x, y), c, s = polygon_m.T, np.cos(yaw_rad)[:, None], np.sin(yaw_rad)[:, None]
+    return xy_m[:, None] + np.stack([c * x - s * y, s * x + c * y], axis=2)
+
+
+def signed_distances_between(first_m: F64, second_m: F64) -> F64:
+    """Distance (M,) of counter-clockwise convex polygons (M, K, 2) and (M, L, 2), pair by pair.
+
+    Negative where they overlap: the length of the shortest motion that parts them. The second ones may repeat
+    corners, and may have no area.
+    """
+    if second_m.shape[1] > _FEW_CORNERS:
+        few = (second_m[:, _FEW_CORNERS:] == second_m[:, _FEW_CORNERS - 1, None]).all((1, 2))
+        if few.any():
+            distances = np.empty(len(first_m))
+            distances[few] = signed_distances_between(first_m[few], second_m[few, :_FEW_CORNERS])
+            distances[~few] = _signed_between(first_m[~few], second_m[~few])
+            return distances
+    return _signed_between(first_m, second_m)
+
+
+def _signed_between(first_m: F64, second_m: F64) -> F64:
+    # Of overlapping polygons the direction that parts them is normal to a side of one (separating axes).
+    found = np.maximum(_beyond_sides(first_m, second_m), _beyond_sides(second_m, first_m))
+    apart = found > 0
+    first_m, second_m = first_m[apart], second_m[apart]
+    nearest = (_corners_to_sides(first_m, second_m), _corners_to_sides(second_m, first_m))
+    found[apart] = np.minimum(*nearest)
+    return found
+
+
+def _beyond_sides(polygons_m: F64, others_m: F64) -> F64:
+    """The largest distance (M,) of others (M, L, 2) beyond the line of a side; negative where none are."""
+    along = following(polygons_m) - polygons_m
+    length = np.sqrt((along**2).sum(2))
+    rel = others_m[:, None] - polygons_m[:, :, None]  # (M, K, L, 2)
+    beyond = (along[:, :, None, 1] * rel[..., 0] - along[:, :, None, 0] * rel[..., 1]).min(2)
+    return np.where(length > 1e-9, beyond / np.maximum(length, 1e-9), -np.inf).max(1)
+
+
+def _corners_to_sides(corners_m: F64, polygons_m: F64) -> F64:
+    """The smallest distance (M,) of corners (M, L, 2) from sides of polygons (M, K, 2)."""
+    along = (following(polygons_m) - polygons_m)[:, :, None]
+    rel = corners_m[:, None] - polygons_m[:, :, None]  # (M, K, L, 2)
+    t = np.clip((rel * along).sum(3) / np.maximum((along**2).sum(3), 1e-18), 0.0, 1.0)
+    return np.sqrt(((rel - t[..., None] * along) ** 2).sum(3).min((1, 2)))
+
+
 def inside_polygon(points_m: F64, polygon_m: F64) -> npt.NDArray[np.bool_]:
     """Whether points (N, 2) lie in a simple polygon (K, 2), by the even-odd rule."""
     x, y = points_m[:, None, 0], points_m[:, None, 1]

@@ -19,7 +19,7 @@ from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import ArmParams, DisturbanceParams, Specification
-from datagen.workers.bases.candidates import SceneCandidates
+from datagen.workers.bases.candidates import SceneCandidates, footprint_of
 from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, translation, yaw_pose
@@ -27,7 +27,7 @@ from datagen.workers.grasps.grasp_cache import GraspSet, grasps_of
 from datagen.workers.kinematics.tree import Bools
 from datagen.workers.motion import MotionPlan, PlanReport
 from datagen.workers.motion.plan_candidate import plan_candidate
-from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
+from datagen.workers.motion.planning_scene import PlanningScene, prepare
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes import SettledScene
@@ -90,9 +90,9 @@ class ArmInScene:
         return self.grasps.T_object_tcp[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
 
     def base_pose(self, candidates: SceneCandidates, row: int) -> F64:
-        """World pose (4, 4) of the mount at candidate `row`, facing the target."""
-        xy = candidates.base_xy_m[row].astype(np.float64)
-        return pose_of_base(xy, self.robot.base_height_m, self.scene.target_center_m)
+        """World pose (4, 4) of the mount at candidate `row`."""
+        (x, y), yaw_rad = candidates.base_xy_m[row].tolist(), float(candidates.base_yaw_rad[row])
+        return yaw_pose(x, y, self.robot.base_height_m, yaw_rad)
 
     def is_within_reach(self, T_world_base: F64) -> bool:
         """Whether the arm is long enough for any grasp of the target, in a straight line."""
@@ -270,11 +270,13 @@ def fits_at(
 ) -> Bools:
     """Whether the body of candidate `row`'s robot fits (K,) with its mount at these world poses (4, 4)."""
     xy = np.array([T[:2, 3] for T in T_arrived], np.float32)
+    yaw_rad = np.array([np.arctan2(T[1, 0], T[0, 0]) for T in T_arrived], np.float32)
     height_m, camera_m = (
         np.repeat(column[row], len(xy)) for column in (candidates.base_height_m, candidates.camera_height_m)
     )
     radius_m, mast_m = np.full(len(xy), at.base_radius_m), spec.candidates.mast_radius_m
-    return base_clearance_m(xy, height_m, camera_m, radius_m, at.scene.house.obstacles, mast_m) >= 0
+    outline = mast_m, footprint_of(spec.candidates), yaw_rad
+    return base_clearance_m(xy, height_m, camera_m, radius_m, at.scene.house.obstacles, *outline) >= 0
 
 
 def disturbances_of(at: ArmInScene, index: int, spec: Specification) -> list[Disturbance]:

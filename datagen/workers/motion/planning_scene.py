@@ -11,7 +11,6 @@ import numpy as np
 from datagen.schemas.specification import MotionParams
 from datagen.workers.bases.clearance import STEP_M
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.grasps.grasp_cache import GraspSet
 from datagen.workers.houses.house import House
 from datagen.workers.kinematics.compiler import in_memory
@@ -262,12 +261,6 @@ def still_of(parts_m: Sequence[F32 | F64], kinds: Sequence[int]) -> Still:
 def _placed(model: ObjectModel, T: F64) -> list[F64]:
     """The world corners of an object's parts, each (V, 3)."""
     return [part.astype(np.float64) @ T[:3, :3].T + T[:3, 3] for part in model.convex_parts_m]
-
-
-def pose_of_base(base_xy_m: F64, base_height_m: float, target_center_m: F64) -> F64:
-    """World pose (4, 4) of the arm's mount at a base position (2,), its x axis turned to the target."""
-    dx, dy = target_center_m[0] - base_xy_m[0], target_center_m[1] - base_xy_m[1]
-    return yaw_pose(float(base_xy_m[0]), float(base_xy_m[1]), base_height_m, float(np.arctan2(dy, dx)))
 
 
 def _static_around(scene: SettledScene, around_m: float) -> tuple[list[F32], list[bool]]:

@@ -43,6 +43,13 @@ class RobotLimits:
     base_radius_m: float | None  # its own mobile base; None stands on a pedestal
     # Corners (x, y) of its base's outline in the base frame: origin below the mount, x to the front.
     footprint_m: tuple[tuple[float, float], ...] | None = None
+    presents: str = "faces"  # how the base stands to the target
+    yaw_rad: float = 0.0  # heading of the base relative to the direction to the target
+
+    @property
+    def polygon_m(self) -> tuple[tuple[float, float], ...] | None:
+        """The outline of a base that keeps its heading; None for circles: a base that turns sweeps one."""
+        return None if self.presents == "turns" else self.footprint_m
 
 
 def robot_limits(name: str) -> RobotLimits:
@@ -54,15 +61,15 @@ def robot_limits(name: str) -> RobotLimits:
     keys, base = source.keys, source.keys.base
     if keys.scaled is not None:
         return RobotLimits(keys.scaled.reach_m, None, None)
-    reach_m = (keys.reach_m or 0.0, keys.reach_m or 0.0)
+    reach_m, stands = (keys.reach_m or 0.0, keys.reach_m or 0.0), (base.presents, base.yaw_rad)
     if base.pedestal and keys.reach_m is not None:
-        return RobotLimits(reach_m, None, None)
+        return RobotLimits(reach_m, None, None, None, *stands)
     if (
         keys.reach_m is not None
         and base.height_m is not None
         and (radius_m := base.outer_radius_m) is not None
     ):
-        return RobotLimits(reach_m, (base.height_m, base.height_m), radius_m, base.footprint_m)
+        return RobotLimits(reach_m, (base.height_m, base.height_m), radius_m, base.footprint_m, *stands)
     return _limits(source)
 
 
@@ -70,8 +77,9 @@ def robot_limits(name: str) -> RobotLimits:
 def _limits(source: RobotSource) -> RobotLimits:
     robot = _built(source, None)
     reach_m, base = source.keys.reach_m or math.ceil(1000 * robot.reach_m) / 1000, robot.base
+    stands = source.keys.base.presents, source.keys.base.yaw_rad
     height_m = None if base.height_m is None else (base.height_m, base.height_m)
-    return RobotLimits((reach_m, reach_m), height_m, base.radius_m, base.footprint_m)
+    return RobotLimits((reach_m, reach_m), height_m, base.radius_m, base.footprint_m, *stands)
 
 
 def open_robot(name: str, reach_m: float | None, base_height_m: float) -> Robot:

@@ -103,11 +103,24 @@ class BaseKeys(_Section):
     height_m: Annotated[float, Field(ge=0, le=10)] | None = None  # of the mount above the floor
     # Where the base turns and (x, y) of candidates lies, in the frame of the arm's base link.
     mount_m: tuple[Length, Length] | None = None
-    presents: Literal["faces", "turns"] = "faces"
+    presents: Literal["faces", "turns", "side"] = "faces"
+    # Of `side`: direction of the target seen from the base, counter-clockwise from x ahead; -90: its right.
+    side_deg: Annotated[float, Field(ge=-180, le=180)] | None = None
     range_deg: tuple[Annotated[float, Field(ge=-360, le=0)], Annotated[float, Field(ge=0, le=360)]] = (
         -180.0,
         180.0,
     )
+
+    @model_validator(mode="after")
+    def _has_side(self) -> BaseKeys:
+        if (self.presents == "side") != (self.side_deg is not None):
+            raise ValueError('presents = "side" and side_deg need each other')
+        return self
+
+    @property
+    def yaw_rad(self) -> float:
+        """Heading of the base relative to the direction from it to the target."""
+        return -math.radians(self.side_deg or 0.0)
 
     @property
     def outer_radius_m(self) -> float | None:
@@ -156,7 +169,7 @@ class RobotFile(_Section):
             raise ValueError("base.pedestal excludes base.footprint_m, base.radius_m and base.height_m")
         if base.footprint_m is not None and base.radius_m is not None:
             raise ValueError("base has footprint_m and radius_m; give one")
-        if self.scaled and (own != (None, None, None) or base.presents == "turns" or self.reach_m):
+        if self.scaled and (own != (None, None, None) or base.presents != "faces" or self.reach_m):
             raise ValueError("scaled arms stand on a pedestal and have no reach_m of their own")
         if any(len(row) != len(self.arm.tucked[0]) for row in self.arm.tucked):
             raise ValueError("arm.tucked has rows of different lengths")

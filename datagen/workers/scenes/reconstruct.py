@@ -26,6 +26,7 @@ _PLACE = "stored scenes"
 _FIX = "Make the run with these scenes again"
 # Tolerance for rotations, which engines give as float32.
 _ROUNDING = 1e-5
+_TURN_RAD = 3.1416  # a little more than half a turn
 _EXTENT_M = 1000.0  # no house is larger
 # Bases farther from the target's centre are of no use, and their distance exceeds the schema's range.
 _NEAR_M = 10.0
@@ -95,6 +96,7 @@ def reconstruct_candidates(columns: Record, scene: ReconstructedScene) -> SceneC
     apart_m = np.hypot(*(columns["base_xy_m"] - scene.target_center_m[:2]).T)
     for name, is_valid in (
         ("base_xy_m", apart_m < _NEAR_M),
+        ("base_yaw_rad", _within(columns["base_yaw_rad"], -_TURN_RAD, _TURN_RAD)),
         ("candidate_index", columns["candidate_index"] >= 0),
         ("robot_index", columns["robot_index"] >= 0),
         ("camera_height_m", _within(columns["camera_height_m"], 0.0, _NEAR_M)),
@@ -106,6 +108,7 @@ def reconstruct_candidates(columns: Record, scene: ReconstructedScene) -> SceneC
             raise _impossible(scene.index, name)
     return SceneCandidates(
         base_xy_m=columns["base_xy_m"],
+        base_yaw_rad=columns["base_yaw_rad"],
         robot_index=columns["robot_index"],
         camera_height_m=columns["camera_height_m"],
         base_height_m=columns["base_height_m"],

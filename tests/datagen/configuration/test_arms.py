@@ -120,6 +120,9 @@ def test_narrowed_candidates_suit_the_robot(robot: str) -> None:
         assert spec.candidates.base_height_m == defaults.base_height_m
     if limits.base_radius_m is not None:
         assert spec.candidates.base_radius_m == limits.base_radius_m
+    # A base that turns in place sweeps its circle.
+    assert spec.candidates.footprint_m == (None if limits.presents == "turns" else limits.footprint_m)
+    assert spec.candidates.yaw_rad is None
 
 
 def test_the_scaled_family_leaves_the_papers_ranges_alone() -> None:
@@ -136,6 +139,7 @@ def test_the_scaled_family_leaves_the_papers_ranges_alone() -> None:
         ("panda-scaled", {"arm_reach_m": {"low": 0.5, "high": 1.1}}, "arm_reach_m"),
         ("panda", {"arm_reach_m": {"low": 0.7, "high": 0.947}}, "arm_reach_m"),
         ("fetch", {"base_radius_m": 0.1}, "base_radius_m"),
+        ("fetch", {"footprint_m": [[0.2, 0.2], [-0.3, 0.3], [-0.3, -0.3], [0.2, -0.2]]}, "footprint_m"),
     ],
 )
 def test_what_a_file_sets_stays_and_is_refused_where_the_robot_has_it_not(

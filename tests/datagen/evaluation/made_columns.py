@@ -9,6 +9,7 @@ import numpy as np
 
 from datagen.evaluation.columns import Columns
 from datagen.schemas.fields import OUTCOMES
+from datagen.schemas.stored_arrays import facing_rad
 
 
 def make_columns(
@@ -25,13 +26,15 @@ def make_columns(
     mount_m = rng.uniform(0, 1.5, n).astype(np.float32)
     reach_m = np.repeat(rng.uniform(0.5, 1.0, n_scenes).astype(np.float32), per_scene)
     label = (rng.random(n) < positive_share) & is_clear & (mount_m <= reach_m)
+    base_xy_m = rng.uniform(-1, 1, (n, 2)).astype(np.float32)
     return Columns(
         scene=scene,
         robot=scene.copy(),
         label=label,
         is_clear=is_clear,
         outcome=np.where(label, 0, rng.integers(1, len(OUTCOMES), n)).astype(np.uint8),
-        base_xy_m=rng.uniform(-1, 1, (n, 2)).astype(np.float32),
+        base_xy_m=base_xy_m,
+        base_yaw_rad=facing_rad(-base_xy_m).astype(np.float32),
         distance_m=(mount_m * 0.9).astype(np.float32),
         mount_distance_m=mount_m,
         reach_m=reach_m,
@@ -52,9 +55,11 @@ def make_grids(label: np.ndarray, score: np.ndarray) -> Columns:
     axis = np.linspace(-1, 1, side)
     y, x = np.meshgrid(axis, axis, indexing="ij")
     order = np.concatenate([rng.permutation(side**2) for _ in range(4)])
+    base_xy_m = np.stack([x.ravel(), y.ravel()], axis=1)[order].astype(np.float32)
     return replace(
         made,
-        base_xy_m=np.stack([x.ravel(), y.ravel()], axis=1)[order].astype(np.float32),
+        base_xy_m=base_xy_m,
+        base_yaw_rad=facing_rad(-base_xy_m).astype(np.float32),
         label=label.ravel()[order].astype(bool),
         is_clear=np.ones(len(made), bool),
         scores={"model": score.ravel()[order]},

@@ -42,7 +42,10 @@ def make_batch(first: int, robots: list[int], per_robot: int = CELLS) -> Batch[A
     extra: dict[str, Any] = {
         "base_is_clear": np.ones(n, np.uint8),
         "outcome": np.zeros(n, np.uint8),
-        **{k: rng.random(n).astype(np.float32) for k in ("distance_m", "mount_distance_m", "visibility")},
+        **{
+            k: rng.random(n).astype(np.float32)
+            for k in ("base_yaw_rad", "distance_m", "mount_distance_m", "visibility")
+        },
         "house_id": np.array([f"house-{first + k}" for k in range(s)], object),
         "object_name": names,
         "object_digest": names,

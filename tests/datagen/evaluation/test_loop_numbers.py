@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,9 +16,9 @@ from datagen.evaluation.closed_loop import (
 )
 from datagen.evaluation.columns import Columns
 from datagen.evaluation.comparisons import Method, TrainedBy
-from datagen.evaluation.grids import AT_RANDOM, BY_LABELS, GridMaps, grid_maps, mixed_grids
+from datagen.evaluation.grids import AT_RANDOM, BY_LABELS, GridMaps, grid_maps, mixed_grids, smoothed
 from datagen.evaluation.scores import weights_for
-from datagen.train.arrivals import ring_arrival
+from datagen.train.arrivals import Arrival, ring_arrival
 from datagen.train.inputs import F64
 from tests.datagen.evaluation.made_columns import make_grids
 
@@ -93,6 +95,15 @@ def test_labels_around_an_arrival_are_those_of_the_cell_that_lies_there() -> Non
         assert nearest.shape == (1, SCENES, 1)
         assert (nearest == label[row, column]).all()
         np.testing.assert_allclose(bilinear, label[row, column], atol=1e-5)
+    # With its right side to the target a base looks along +y there: ahead is the next row.
+    right = replace(columns, base_yaw_rad=(columns.base_yaw_rad + np.pi / 2).astype(np.float32))
+    np.testing.assert_allclose(np.cos(maps_of(right).yaw_rad - np.pi / 2), 1.0)
+    assert not maps.yaw_rad.any()
+    ahead = np.tile([STEP_M, 0.0, 0.0], (1, SCENES, 1, 1))
+    assert (label_success(right, maps_of(right), goal, ahead)[0] == label[7, 3]).all()
+    drift = Arrival("ahead", np.array([[STEP_M, 0.0, 0.0]]), False)
+    expected = smoothed(maps.truth, maps_of(right), drift)[:, 6, 3]
+    np.testing.assert_allclose(expected, label[7, 3], atol=1e-6)
     far = np.tile([-1.0, 0.0, 0.0], (1, SCENES, 1, 1))
     assert not np.any(label_success(columns, maps, goal, far))
 

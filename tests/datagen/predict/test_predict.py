@@ -13,6 +13,7 @@ import safetensors.torch
 import torch
 from PIL import Image
 
+import datagen.workers.robots
 from datagen import cli
 from tests.datagen.predict.frames import arguments, frame_with
 from tests.refusals import refused
@@ -91,6 +92,34 @@ def test_a_click_and_the_same_frame_as_folder_archive_and_cloud(
     np.testing.assert_allclose(ours, theirs, atol=1e-4)
     assert np.ptp(theirs) > 0.1
     assert found["click"]["target"]["mask_pixels"] == pytest.approx(mask.sum(), rel=0.15)
+
+
+def test_a_robots_file_gives_its_sizes_and_the_heading_of_its_side(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    panda = (Path(datagen.workers.robots.__file__).parent / "panda.toml").read_text()
+    base = "footprint_m = [[0.3, 0.1], [-0.3, 0.1], [-0.3, -0.1], [0.3, -0.1]]\nheight_m = 0.65\n"
+    side = 'presents = "side"\nside_deg = -90\n'
+    answers = []
+    for name, more in (("ahead", ""), ("right", side)):
+        (tmp_path / f"{name}.toml").write_text(panda.replace("pedestal = true\n", base + more))
+        robot = ("--robot", str(tmp_path / f"{name}.toml"))
+        answers.append(json_of(capsys, arguments(made, *robot, drop=("--base-height", "--reach"))))
+    _, right = answers
+    assert right["robot"]["base_height_m"] == 0.65 and right["robot"]["arm_reach_m"] == 0.947
+    turns = [
+        b["yaw_rad"] - a["yaw_rad"] for a, b in zip(*(each["candidates"] for each in answers), strict=True)
+    ]
+    np.testing.assert_allclose(np.cos(np.array(turns) - np.pi / 2), 1.0)
+    T, (x, y, _) = np.array(right["best"]["T_world_base"]), right["target"]["center_m"]
+    at_right = np.linalg.inv(T) @ (x, y, 0.65, 1.0)
+    assert at_right[1] < -0.1 and abs(at_right[0]) < 1e-6
+    states = [[c["state"] for c in each["candidates"]] for each in answers]
+    assert states[0] != states[1]  # the base is longer than wide
+    own = json_of(capsys, arguments(made, *robot, "--base-height", "0.8", drop=("--reach",)))
+    assert own["robot"]["base_height_m"] == 0.8
+    refused(arguments(made, "--robot", "hal"), capsys, "--robot", "hal", "panda")
+    refused(arguments(made, "--robot", "panda-scaled", drop=("--reach",)), capsys, "--reach", "missing")
 
 
 def test_a_frame_without_a_clear_place_ends_with_1(made: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,7 +18,7 @@ from datagen.workers.bases.candidates import (
     draw_candidates,
     grid_offsets,
 )
-from datagen.workers.bases.clearance import Obstacles, base_clearance_m, obstacles_of
+from datagen.workers.bases.clearance import Footprint, Obstacles, base_clearance_m, obstacles_of
 from datagen.workers.houses.house import StaticBody
 from tests.workers.worlds import ROOM_M, TABLE_SIZE_M, TABLE_TOP_M, box_body, table_house
 
@@ -122,6 +122,26 @@ def test_reaches_are_whole_steps_within_their_range(seed: int, low: float, width
     np.testing.assert_allclose(reach_m[inside] * 100, np.round(reach_m[inside] * 100), atol=1e-4)
 
 
+@given(st.integers(0, 2**32), st.sampled_from([None, "clear"]), st.floats(-3.1, 3.1), st.floats(0.0, 3.0))
+@settings(max_examples=30, deadline=None)
+def test_headings_lie_in_their_interval_and_change_no_position(
+    seed: int, within: str | None, low: float, width: float
+) -> None:
+    limits = {"low": low, "high": min(low + width, 3.14)}
+    plain, turned = (draw(seed, per_scene=40, within=within, yaw_rad=yaw) for yaw in (None, limits))
+    for name in ("base_xy_m", "camera_height_m", "base_height_m", "arm_reach_m", "clearance_m"):
+        np.testing.assert_array_equal(getattr(turned, name), getattr(plain, name), name)
+    towards = TARGET[:2] - plain.base_xy_m
+    facing = np.arctan2(towards[:, 1], towards[:, 0])
+    np.testing.assert_array_equal(plain.base_yaw_rad, facing.astype(np.float32))
+    middle = (limits["low"] + limits["high"]) / 2
+    off = np.angle(np.exp(1j * (turned.base_yaw_rad - facing - middle)))
+    assert np.abs(off).max() <= (limits["high"] - limits["low"]) / 2 + 1e-5
+    assert np.abs(turned.base_yaw_rad).max() <= np.float32(np.pi)
+    if width > 0.5 and limits["high"] > limits["low"] + 0.5:
+        assert off.std() == pytest.approx((limits["high"] - limits["low"]) / np.sqrt(12), rel=0.4)
+
+
 def cupboard(side: int, gap_m: float, depth_m: float = 0.4) -> StaticBody:
     """A cupboard along one side of the table."""
     along = side % 2
@@ -146,14 +166,22 @@ def plain_candidates(
     half_m = params.grid_half_width_m / (params.grid_cells - 1)
     jitter_m = rng.uniform(-half_m, half_m, (len(orders), 2))
     xy_m = (target_m[:2] + (cells[orders] + jitter_m)).astype(np.float32)
+    yaw_rad = np.arctan2(*(target_m[:2] - xy_m)[:, ::-1].T)
+    if params.yaw_rad is not None:
+        turned = yaw_rad + rng.uniform(params.yaw_rad.low, params.yaw_rad.high, len(orders))
+        yaw_rad = (turned + np.pi) % (2 * np.pi) - np.pi
+    yaw_rad = yaw_rad.astype(np.float32)
+    footprint = None if params.footprint_m is None else Footprint(params.footprint_m)
     free = np.ones(len(xy_m), np.bool_)
     rows = np.empty(n, np.int64)
     robots: list[int] = []
     for k in range(draws):
         camera, mount, reach = (np.full(len(xy_m), v[k]) for v in (camera_m, mount_m, reach_m))
         radius_m = params.radius_of_base_m(reach)
-        clearance_m = base_clearance_m(xy_m, mount, camera, radius_m, obstacles, params.mast_radius_m)
-        there = SceneCandidates(xy_m, np.zeros(len(xy_m), np.int16), camera, mount, reach, clearance_m)
+        mast_m = params.mast_radius_m
+        clearance_m = base_clearance_m(xy_m, mount, camera, radius_m, obstacles, mast_m, footprint, yaw_rad)
+        one = np.zeros(len(xy_m), np.int16)
+        there = SceneCandidates(xy_m, yaw_rad, one, camera, mount, reach, clearance_m)
         inside = clearance_m >= 0
         if params.within == "in-range":
             inside &= distances(there, target_m)[1] <= reach
@@ -169,9 +197,9 @@ def plain_candidates(
             heights = (camera_m[robot], mount_m[robot])
             radius_m = params.radius_of_base_m(reach_m[robot])
             clearance_m = base_clearance_m(
-                xy_m[rows], heights[1], heights[0], radius_m, obstacles, params.mast_radius_m
+                xy_m[rows], heights[1], heights[0], radius_m, obstacles, mast_m, footprint, yaw_rad[rows]
             )
-            return SceneCandidates(xy_m[rows], index, *heights, reach_m[robot], clearance_m)
+            return SceneCandidates(xy_m[rows], yaw_rad[rows], index, *heights, reach_m[robot], clearance_m)
     return None
 
 
@@ -194,9 +222,12 @@ def test_candidates_with_within_are_those_of_trying_every_robot_everywhere(
     low, high = (inset_m, inset_m), (ROOM_M[0] - inset_m, ROOM_M[1] - inset_m)
     floor = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
     obstacles = replace(obstacles, floors_m=(floor,))
-    params = CandidateParams.model_validate(
-        {"per_scene": n, "within": within, "scaled_base": scaled, "robots_per_scene": robots}
-    )
+    given = {"per_scene": n, "within": within, "scaled_base": scaled, "robots_per_scene": robots}
+    if data.draw(st.booleans()):
+        given["footprint_m"] = [[0.3, 0.15], [-0.45, 0.2], [-0.4, -0.2], [0.3, -0.15]]
+        low = data.draw(st.floats(-3, 3))
+        given["yaw_rad"] = data.draw(st.sampled_from([None, {"low": low, "high": low + 0.1}]))
+    params = CandidateParams.model_validate(given)
     target_m = np.array([*MIDDLE, TABLE_TOP_M + 0.05])
     made, plain = (
         draw(target_m, obstacles, params, np.random.default_rng(seed))
@@ -206,6 +237,13 @@ def test_candidates_with_within_are_those_of_trying_every_robot_everywhere(
     if made is not None and plain is not None:
         assert (made.clearance_m >= 0).all()
         assert within == "clear" or (distances(made, target_m)[1] <= made.arm_reach_m).all()
-        for name in ("base_xy_m", "robot_index", "camera_height_m", "base_height_m", "arm_reach_m"):
+        for name in (
+            "base_xy_m",
+            "base_yaw_rad",
+            "robot_index",
+            "camera_height_m",
+            "base_height_m",
+            "arm_reach_m",
+        ):
             np.testing.assert_array_equal(getattr(made, name), getattr(plain, name), name)
         np.testing.assert_array_equal(made.clearance_m, plain.clearance_m)

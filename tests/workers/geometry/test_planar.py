@@ -12,6 +12,8 @@ from datagen.workers.geometry.planar import (
     convex_hull,
     inside_any,
     inside_polygon,
+    polygons_at,
+    signed_distances_between,
     signed_distances_to_convex,
     stack_polygons,
 )
@@ -48,6 +50,29 @@ def test_distance_is_never_more_than_to_any_sampled_border_point(
     assert (distance <= sampled + 1e-9).all()
     spacing = np.linalg.norm(np.roll(hull, -1, axis=0) - hull, axis=1).max() / 16
     assert (distance >= sampled - spacing).all()
+
+
+@given(
+    arrays(np.float64, (6, 2), elements=coordinates),
+    arrays(np.float64, (7, 2), elements=coordinates),
+    st.integers(1, 7),
+    st.floats(-7, 7),
+)
+def test_the_distance_of_polygons_is_that_of_the_origin_from_their_difference(
+    first: np.ndarray, second: np.ndarray, corners: int, yaw_rad: float
+) -> None:
+    """By Minkowski: one is moved out of the other by what moves all differences of points off the origin."""
+    one, other = convex_hull(first), convex_hull(second[:corners])  # also a segment or a point
+    if len(one) < 3 or not np.ptp(one, axis=0).min() > 1e-3:
+        return
+    one = polygons_at(one, np.array([[0.3, -0.2]]), np.array([yaw_rad]))[0]
+    apart = convex_hull((other[:, None] - one[None]).reshape(-1, 2))
+    wanted = signed_distances_to_convex(np.zeros((1, 2)), apart[None])[0, 0]
+    pair = stack_polygons([other, np.zeros((9, 2))])[0]  # padded
+    found = signed_distances_between(one[None], pair[None])[0]
+    assert found == pytest.approx(wanted, abs=1e-6)
+    both = signed_distances_between(np.stack([one, one]), np.stack([pair, pair + 20.0]))
+    assert both[0] == pytest.approx(found, abs=1e-12) and both[1] > 0
 
 
 def test_padding_does_not_change_distances() -> None:

@@ -23,6 +23,7 @@ from datagen.schemas.specification import (
     TrialParams,
     VisibilityParams,
 )
+from datagen.schemas.stored_arrays import facing_rad
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.transforms import pose, translation
@@ -70,8 +71,9 @@ def candidates(at: SettledScene) -> SceneCandidates:
     params = CandidateParams(base_radius_m=0.2)
     radius_m = np.full(n, params.base_radius_m)
     clearance = base_clearance_m(xy, height_m, camera_m, radius_m, at.house.obstacles, params.mast_radius_m)
+    yaw_rad = facing_rad(at.target_center_m[:2] - xy).astype(np.float32)
     return SceneCandidates(
-        xy, np.zeros(n, np.int16), camera_m, height_m, ones * np.float32(REACH_M), clearance
+        xy, yaw_rad, np.zeros(n, np.int16), camera_m, height_m, ones * np.float32(REACH_M), clearance
     )
 
 
@@ -95,7 +97,7 @@ def test_each_candidate_has_the_cause_a_person_would_name(labelled: dict[str, An
 
 
 def test_columns_are_those_of_the_schema(labelled: dict[str, Any]) -> None:
-    drawn = {"sample_id", "sample_scene_index", "candidate_index", "robot_index", "base_xy_m"}
+    drawn = {"sample_id", "sample_scene_index", "candidate_index", "robot_index", "base_xy_m", "base_yaw_rad"}
     drawn |= {"camera_height_m", "base_height_m", "arm_reach_m", "base_clearance_m", "base_is_clear"}
     drawn |= {"label_source", "label_version"}
     for name, columns in labelled.items():

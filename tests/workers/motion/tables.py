@@ -10,10 +10,11 @@ import numpy as np
 
 from datagen.schemas.specification import MotionParams
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.grasps.grasp_cache import GraspSet
 from datagen.workers.houses.house import House, StaticBody
 from datagen.workers.motion import PlanReport
-from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
+from datagen.workers.motion.planning_scene import PlanningScene, prepare
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.rendering import SceneGeometry
 from datagen.workers.rendering.embree import ray_scene
@@ -90,8 +91,8 @@ def front_base(
 ) -> F64:
     """A base pose in front of the table, `away_m` from the target along y."""
     center = scene.target_center_m
-    xy = np.array([center[0] + dx_m, center[1] - away_m])
-    return pose_of_base(xy, (robot or arm()).base_height_m, center)
+    yaw_rad = float(np.arctan2(away_m, -dx_m))
+    return yaw_pose(center[0] + dx_m, center[1] - away_m, (robot or arm()).base_height_m, yaw_rad)
 
 
 def digest(report: PlanReport) -> str:

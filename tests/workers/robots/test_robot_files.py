@@ -118,6 +118,14 @@ def test_python_and_predict_accept_a_file_wherever_a_name_is(make: Made) -> None
     assert read_footprint(path).corners_m == read_footprint([list(corner) for corner in corners]).corners_m
     with pytest.raises(InputError, match=r"gone\.toml: cannot be read"):
         read_footprint("gone.toml")
+    turning = make(folder="b", more='[base]\npresents = "turns"\n')
+    assert read_footprint(turning).corners_m == () and datagen.robots[turning].yaw_rad == 0
+    assert read_footprint(turning).radius_m == datagen.robots[turning].base_radius_m
+    round_one = make(folder="c", more="[base]\nradius_m = 0.35\n")
+    assert (read_footprint(round_one).corners_m, read_footprint(round_one).radius_m) == ((), 0.35)
+    right = make(folder="d", more='[base]\npresents = "side"\nside_deg = -90\n')
+    assert datagen.robots[right].yaw_rad == pytest.approx(np.pi / 2)
+    assert read_footprint(right).corners_m == read_footprint(path).corners_m
 
 
 def test_a_mimic_of_a_mimic_follows_the_driver(tmp_path: Path) -> None:
@@ -189,6 +197,9 @@ def test_a_digest_depends_on_content_and_not_on_the_place(make: Made) -> None:
         (("", ""), ("", ""), "[base]\nfootprint_m = [[1, 1], [2, 1], [2, 2]]\n", r"does not hold the mount"),
         (("", ""), ("", ""), "[base]\nfootprint_m = [[1, 1], [2, 1]]\n", r"base\.footprint_m"),
         (("", ""), ("", ""), "[base]\nfootprint_m = [[-1, 0], [0, 0], [1, 0]]\n", r"has no area"),
+        (("", ""), ("", ""), '[base]\npresents = "side"\n', r"side_deg need each"),
+        (("", ""), ("", ""), "[base]\nside_deg = 30.0\n", r"side_deg need each"),
+        (("", ""), ("", ""), '[base]\npresents = "side"\nside_deg = 190\n', r"base\.side_deg: .* 180"),
         (("", ""), ("", ""), "[base]\npedestal = true\nradius_m = 0.3\n", r"excludes"),
         (('"base"\n', '"base"\ntucked = [[0.0, 0.0]]\n'), ("", ""), "", r"arm\.tucked: has rows of 2"),
         (('"base"\n', '"base"\nignore = ["gone"]\n'), ("", ""), "", r"arm\.ignore: link gone"),

@@ -1,0 +1,158 @@
+"""Headings of bases from the command line: sampled ones, and a robot that shows its side to the target."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import datagen.workers.robots
+from datagen import cli
+from datagen.replaying import open_sources
+from datagen.schemas.fields import OUTCOMES
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import StageClock
+from datagen.schemas.shard_reading import read_scene
+from datagen.workers.bases.clearance import Footprint, base_clearance_m
+from datagen.workers.geometry.transforms import yaw_pose
+from datagen.workers.labels.arm_labelling import arm_in_scene
+from datagen.workers.labels.arrival_trial import try_arrival
+from datagen.workers.robots import ROBOTS, robot_limits
+from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
+from tests.refusals import refused
+from tests.sim_extra import needs_sim
+from tests.small_runs import CONFIG, HERE, PER_SCENE, arrays_of, make_small_run
+
+OUTLINE = [[0.3, 0.2], [-0.25, 0.2], [-0.25, -0.2], [0.3, -0.2]]
+SAMPLED = CONFIG + "[candidates]\nyaw_rad = {low = -0.5, high = 1.0}\n"
+ROWS = 12
+
+
+def relative(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """Headings relative to the direction to the target."""
+    scene = np.searchsorted(arrays["scene_index"], arrays["sample_scene_index"])
+    towards = arrays["target_center_m"][scene, :2] - arrays["base_xy_m"]
+    return np.angle(np.exp(1j * (arrays["base_yaw_rad"] - np.arctan2(towards[:, 1], towards[:, 0]))))
+
+
+def test_sampled_headings_are_stored_and_no_model_trains_on_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = make_small_run(tmp_path / "run", 3 * PER_SCENE, config=SAMPLED)
+    found, plain = relative(arrays_of(run)), arrays_of(make_small_run(tmp_path / "plain", 3 * PER_SCENE))
+    assert found.min() > -0.5 - 1e-5 and found.max() < 1.0 + 1e-5 and np.ptp(found) > 0.9
+    np.testing.assert_allclose(relative(plain), 0.0, atol=1e-6)
+    np.testing.assert_array_equal(arrays_of(run)["base_xy_m"], plain["base_xy_m"])
+    assert cli.run(["verify", str(run), "--replay", "1"]) == 0
+    words = ("candidates.yaw_rad", "headings of the base are sampled")
+    for trained, validated in ((run, tmp_path / "plain"), (tmp_path / "plain", run)):
+        line = ["train", "stage1", str(trained), "--val", str(validated)]
+        refused([*line, "--out", str(tmp_path / "a.ckpt")], capsys, str(run), *words)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("yaw_rad = {low = 0.5, high = -0.5}", ["candidates.yaw_rad", "high -0.5 is below low 0.5"]),
+        ("yaw_rad = {low = -4.0, high = 0.0}", ["candidates.yaw_rad.low", "-3.14"]),
+        ("yaw_rad = 1.0", ["candidates.yaw_rad"]),
+        ("yaw_rad = {low = nan, high = 0.0}", ["candidates.yaw_rad.low"]),
+        ("footprint_m = [[1, 1], [2, 1], [2, 2]]", ["candidates", "does not hold the mount"]),
+        (
+            "footprint_m = [[0.3, 0.2], [-0.3, -0.2], [-0.3, 0.2], [0.3, -0.2]]",
+            ["candidates.footprint_m", "cro"],
+        ),
+        ("footprint_m = [[0.3, 0.2], [-0.3, 0.2]]", ["candidates.footprint_m", "3"]),
+        ("footprint_m = [[0.3, 0.2], [-0.3, 0.2], [0.0, -30.0]]", ["candidates.footprint_m", "20"]),
+        ("footprint_m = [[0.3], [-0.3, 0.2], [0.0, -0.3]]", ["candidates.footprint_m"]),
+        ('footprint_m = "round"', ["candidates.footprint_m"]),
+    ],
+)
+def test_headings_and_footprints_that_cannot_be_are_one_line(
+    tmp_path: Path, text: str, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run.toml").write_text(f"[candidates]\n{text}\n")
+    line = ["submit", "heuristic", "--n", "4", "--out", str(tmp_path / "a"), "--config"]
+    refused([*line, str(tmp_path / "run.toml"), *HERE], capsys, "run.toml", *words)
+
+
+@pytest.fixture(scope="module")
+def sideways(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """A Panda on an oblong base that has the target at its right, and plans of it. Tests only read them."""
+    folder = tmp_path_factory.mktemp("sideways")
+    text = (
+        (Path(datagen.workers.robots.__file__).parent / ROBOTS["panda"])
+        .read_text()
+        .replace('name = "panda"', 'name = "sideways"')
+    )
+    base = f'footprint_m = {OUTLINE}\nheight_m = 0.6\npresents = "side"\nside_deg = -90\n'
+    robot = folder / "sideways.toml"
+    robot.write_text(text.replace("pedestal = true\n", base))
+    (folder / "run.toml").write_text(CONFIG + "[arm.grasps]\nper_object = 40\nper_scene = 10\n")
+    line = ["submit", "plan", "--n", str(2 * ROWS), "--out", str(folder / "run"), "--robot", str(robot)]
+    more = ["--candidates", "in-range", "--candidates-per-scene", str(ROWS), "--seed", "5", *HERE]
+    assert cli.run([*line, *more, "--config", str(folder / "run.toml")]) == 0
+    return str(robot), folder / "run"
+
+
+@needs_sim
+def test_a_robot_works_at_its_side(sideways: tuple[str, Path], tmp_path: Path) -> None:
+    robot_file, run = sideways
+    arrays, opened = arrays_of(run), Run.open(run)
+    np.testing.assert_allclose(relative(arrays), np.pi / 2, atol=1e-5)  # the target at its right
+    assert robot_limits(robot_file).yaw_rad == pytest.approx(np.pi / 2)
+    spec, (world, _) = opened.manifest.spec, open_sources(opened)
+    good = arrays["label"] == 1
+    # The arm turns to the right, and its hand is at the planned grasp with the base at its heading.
+    assert good.sum() >= 3 and np.median(arrays["q_grasp_rad"][good, 0]) == pytest.approx(-np.pi / 2, abs=0.8)
+    for index in range(2):
+        rows = read_scene(opened, index)
+        scene = reconstruct_scene(world, rows.record)
+        candidates = reconstruct_candidates(rows.samples, scene)
+        at = arm_in_scene(scene, candidates, 0, spec, StageClock())
+        clearance_m = base_clearance_m(
+            candidates.base_xy_m, candidates.base_height_m, candidates.camera_height_m,
+            spec.candidates.radius_of_base_m(candidates.arm_reach_m), scene.house.obstacles,
+            spec.candidates.mast_radius_m, Footprint(OUTLINE), candidates.base_yaw_rad,
+        )  # fmt: skip
+        np.testing.assert_array_equal(clearance_m, candidates.clearance_m)
+        assert (clearance_m >= 0).all()
+        for row, outcome in enumerate(rows.samples["outcome"].tolist()):
+            made = try_arrival(at, candidates, row, (0.0, 0.0, 0.0), None, spec)
+            assert made == tuple(OUTCOMES)[outcome]
+            if outcome == 0:
+                (x, y), yaw = candidates.base_xy_m[row], candidates.base_yaw_rad[row]
+                T_world_tcp = yaw_pose(float(x), float(y), 0.6, float(yaw)) @ at.robot.T_base_tcp(
+                    rows.samples["q_grasp_rad"][row].astype(np.float64)
+                )
+                wanted = scene.T_world_object[0] @ rows.samples["T_target_tcp"][row]
+                np.testing.assert_allclose(T_world_tcp, wanted, atol=0.002)
+    out = ["--out", str(tmp_path / "a.png")]
+    assert cli.run(["show", str(run), "--scene", "0", *out]) == 0
+    assert cli.run(["show", str(run), "--scene", "0", "--trial", "best", *out]) == 0
+    assert cli.run(["verify", str(run), "--replay", "1"]) == 0
+
+
+@needs_sim
+def test_scenes_of_a_robot_that_faces_the_target_do_not_suit_it(
+    sideways: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot_file, _ = sideways
+    text = Path(robot_file).read_text().replace('presents = "side"\nside_deg = -90\n', "")
+    (tmp_path / "ahead.toml").write_text(text.replace("sideways", "ahead"))
+    make_small_run(tmp_path / "run", PER_SCENE, "--robot", str(tmp_path / "ahead.toml"))
+    line = [
+        "submit",
+        "plan",
+        "--n",
+        "4",
+        "--scenes-from",
+        str(tmp_path / "run"),
+        "--out",
+        str(tmp_path / "b"),
+        "--robot",
+    ]
+    refused([*line, robot_file], capsys, "candidates.yaw_rad", "stands at 1.5708 to the target")
+    (tmp_path / "wide.toml").write_text(text.replace("[0.3, 0.2]", "[0.6, 0.2]").replace("sideways", "wide"))
+    refused([*line, str(tmp_path / "wide.toml")], capsys, "candidates", "wide")
