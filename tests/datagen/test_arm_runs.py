@@ -51,9 +51,9 @@ def test_specifications_hold_the_arm_and_what_moves_it(paired: dict[str, Path]) 
     assert [arm is not None and arm.trial is not None for arm in arms] == [False, True, True]
     assert [arm is not None and arm.disturbance is not None for arm in arms] == [False, False, True]
     for manifest in (plan, sim, disturbed):
-        assert {"pin", "coal", "mani_skill", "sapien", "scenes", "labels"} <= manifest.spec.engines.keys()
-        assert {"pin", "coal", "mani_skill"} <= manifest.libraries.keys()
-    assert not Run.open(paired["heuristic"]).manifest.spec.engines.keys() & {"pin", "coal", "mani_skill"}
+        assert {"numba", "coal", "mani_skill", "sapien", "scenes", "labels"} <= manifest.spec.engines.keys()
+        assert {"numba", "coal", "mani_skill"} <= manifest.libraries.keys()
+    assert not Run.open(paired["heuristic"]).manifest.spec.engines.keys() & {"numba", "coal", "mani_skill"}
 
 
 def test_the_arm_of_a_stored_run_stays_and_its_disturbance_does_not(paired: dict[str, Path]) -> None:

@@ -59,7 +59,7 @@ def test_the_example_of_a_specification_has_the_defaults_also_where_it_comments_
     fields = tomllib.loads(re.sub(r"^# ", "", example[1], flags=re.MULTILINE))
     spec = Specification.model_validate(SOURCES | fields)
     assert spec.arm == ArmParams(trial=TrialParams(), disturbance=DisturbanceParams())
-    assert set(fields["arm"]) == set(ArmParams.model_fields) - {"robot_digest", "joints"}
+    assert set(fields["arm"]) == set(ArmParams.model_fields) - {"robot_digest", "joints", "draws"}
     corners = ((0.3, 0.2), (-0.3, 0.2), (-0.3, -0.2), (0.3, -0.2))
     turns = Turns(low=-0.5, high=0.5)
     absent = {"within": "clear", "scaled_base": True, "footprint_m": corners, "yaw_rad": turns}
