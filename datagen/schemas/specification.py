@@ -159,7 +159,7 @@ class MotionParams(Frozen):
     path_iterations: int = Field(default=200, ge=1, le=1_000_000)
     # Rounds of a search near the grasps that came furthest, where none has a plan. None, in specifications
     # older than label version 4: no such search.
-    nearby_rounds: int | None = Field(default=None, ge=0, le=100)
+    nearby_rounds: int | None = Field(default=None, ge=0, le=50)
     # Distance of the arm from all obstacles, and of the hand up to the pregrasp.
     margin_m: float = Field(default=0.005, ge=0, le=0.2)
 
