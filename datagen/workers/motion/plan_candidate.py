@@ -32,6 +32,7 @@ _PORTION = 96  # poses ordered together at first; each further portion is as lar
 _SHORT = 8  # poses tried to tell a lift that is too far from no solution
 # The search near poses: poses in a round, the most that they are near, and those for which IK is tried.
 _NEARBY, _ORIGINS, _NEARBY_TRIED = 480, 24, 48
+_MOST_SLIPPED = 4  # that are simulated: where these do not hold, others seldom do
 # In each round and in all: a turn about the closing axis; tilts about the pads' width and the approach,
 # within the contacts' friction cone; shifts along them, by less than half a pad.
 _MOTION_STD = np.array([np.radians(20), np.radians(3), np.radians(3), 0.003, 0.003])
@@ -69,6 +70,7 @@ class _Search:
     rng: np.random.Generator
     tried: int = 0  # poses for which inverse kinematics was tried
     furthest: int = 0  # stage
+    slipped: int = 0  # poses near grasps that did not hold
     # The row (-1: none), pose and opening of each grasp without a straight path.
     without_path: list[tuple[int, F64, int]] = field(default_factory=list)
 
@@ -129,7 +131,11 @@ class _Search:
         """Whether the hand holds the object at a pose; simulated on first use."""
         around = self.scene.around
         if row < 0:
-            return self.score(row, T_world_tcp, opening) >= around.grasps.min_score
+            is_held = self.slipped < _MOST_SLIPPED and self.score(row, T_world_tcp, opening) >= (
+                around.grasps.min_score
+            )
+            self.slipped += not is_held
+            return is_held
         return around.grasps.holds(int(around.grasp[row]))
 
     def score(self, row: int, T_world_tcp: F64, opening: int) -> float:
@@ -188,7 +194,7 @@ def _near_grasps(search: _Search, rows: list[int]) -> MotionPlan | None:
     arrays = search.scene.around.arrays
     T, opening, motion = arrays.T_world_tcp[rows], arrays.opening[rows], np.zeros((len(rows), 5))
     for _ in range(search.scene.params.nearby_rounds or 0):
-        if len(T) == 0:
+        if len(T) == 0 or search.slipped >= _MOST_SLIPPED:
             break
         each = _NEARBY // len(T)
         T, opening = np.repeat(T, each, axis=0), np.repeat(opening, each)
