@@ -28,7 +28,6 @@ PAPER = {
     "accuracy": {
         "proximity": 0.4691,
         "threshold": 0.5691,
-        "threshold-detector": 0.6873,
         "stage1": 0.7675,
         "sim-only": 0.7911,
         "two-stage": 0.8413,

@@ -136,7 +136,7 @@ def test_the_same_command_resumes_after_an_interrupt_and_makes_nothing_twice(
     assert first == json.loads((made / "loop.json").read_text())["closed_loop"]
     # Another method makes only its own arrivals; equal ones are there already.
     page = ["--out", str(out / "loop.html")]
-    more = json_of(capfd, words(grids, out, "--baselines", "threshold-detector", *page))["closed_loop"]
+    more = json_of(capfd, words(grids, out, "--baselines", "threshold-visibility", *page))["closed_loop"]
     assert calls > n
     wider = outcomes_in(out)
     assert all(whole[name].items() <= wider[name].items() for name in whole)
