@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-EXTRAS = ("base", "labels", "cluster", "sim", "train", "detect", "all")
+EXTRAS = ("base", "labels", "cluster", "sim", "train", "all")
 IMPORT = "import datagen"
 
 

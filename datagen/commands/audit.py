@@ -1,4 +1,4 @@
-"""`datagen audit`: what runs made, its cost and waste, and the cost of the paper's 180,000 labels."""
+"""`datagen audit`: what runs made, its cost and waste."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from datagen.schemas.run import open_runs
 def audit(
     runs: Annotated[list[str], Parameter(name="RUN...")], /, *, full: bool = False, json: AsJson = False
 ) -> int:
-    """Show what was made, what it cost per label, what was wasted, and what 180,000 would cost.
+    """Show what was made, what it cost per label, and what was wasted.
 
     Costs are core time: CPU seconds, and the wall time of killed attempts. A label costs its run's whole
     cost, waste included, divided by the labels of that kind. Name the run that made the scenes beside runs of
@@ -28,7 +28,7 @@ def audit(
 
     Args:
         runs: Runs of one or several label sources.
-        full: Also show costs by stage, rejected scenes, and the paper's costs.
+        full: Also show costs by stage and rejected scenes.
     """
     if not runs:
         raise InputError("datagen audit", "RUN", "is missing", "Name one or more run folders")

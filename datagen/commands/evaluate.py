@@ -25,7 +25,6 @@ def evaluate(
     *,
     fit: PathsOrAddresses | None = None,
     baselines: Sequence[str] | None = None,
-    detector: File | None = None,
     heuristic: File | None = None,
     arrival: Sequence[str] | None = None,
     closed_loop: Whole | None = None,
@@ -53,7 +52,6 @@ def evaluate(
         paths: Checkpoints of `datagen train`, or `released`, and runs of sim or plan labels.
         fit: Run in validation houses to fit baselines on; repeat for more.
         baselines: Baseline to compare with, or none; repeat for more. [default: all]
-        detector: Folder of a zero-shot object detector, for the detector baseline.
         heuristic: Parameters of the analytic baseline, from `datagen calibrate`.
         arrival: Arrival error: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv. [default: 0 to 25 cm]
         closed_loop: Scenes of the closed loop, the first whole grids with a good base pose. [default: 0]
@@ -95,8 +93,8 @@ def evaluate(
     if not allow_seen_houses:
         refuse_seen_houses(runs, models)
     rule = None if heuristic is None else read_heuristic(Path(heuristic), runs, allow_seen_houses)
-    fitted_on, folder = [str(path) for path in fit or ()], None if detector is None else Path(detector)
-    plain = baseline_methods(baselines, fitted_on, runs, folder, rule, allow_seen_houses, json)
+    fitted_on = [str(path) for path in fit or ()]
+    plain = baseline_methods(baselines, fitted_on, runs, rule, allow_seen_houses, json)
     methods = [*plain.baselines, *models]
     if not methods:
         fix = "Name a checkpoint, or omit --baselines"

@@ -81,7 +81,7 @@ def resume(options: ResumeOptions) -> JobResult:
         with options.display() as shown:
             shown.phase("opening houses and objects")
             storage = open_storage(path, create=False)
-            job_runs = [open_job_run(each, options, options.address) for each in open_runs(storage)]
+            job_runs = [open_job_run(each, options) for each in open_runs(storage)]
         if options.n is not None:
             _extend(job_runs, options.n, path)
         if options.quarantined:

@@ -208,7 +208,7 @@ def _specified(options: SubmitOptions, shown: Progress) -> tuple[Run | None, Man
         fields = {"seed": options.seed, "split": options.split, **_candidate_fields(options)}
         spec = specify(label_source, house_source, object_source, fields, config, *chosen)
         world = assemble_world(spec, house_source, object_source, houses, objects)
-        refuse_unusable_engines(spec, options.address)
+        refuse_unusable_engines(spec)
         if run is None:
             _refuse_no_scene(world, houses)
         surveys = survey_sources(house_source, object_source, shown.counter("houses examined"))
@@ -225,7 +225,7 @@ def _specified(options: SubmitOptions, shown: Progress) -> tuple[Run | None, Man
         spec = specify_again(label_source, stored, config, *chosen)
         houses, objects = stored.houses, stored.objects
         world = open_world(spec, houses, objects, options.robot or stored.robot)
-        refuse_unusable_engines(spec, options.address)
+        refuse_unusable_engines(spec)
         layout = layout_again(spec, stored, options.n) if run is None else run.layout
         refuse_too_few(stored, layout, options.n)
         known = stored.run.manifest.sources

@@ -44,10 +44,6 @@ _LIBRARIES = {
     "libgomp.so.1": "libgomp1",
 }
 _AGAIN = "Install it again: pip install --force-reinstall"
-_MESA_FIX = (
-    "Only --renderer sapien needs one; on a CPU it works with Mesa 25 or newer: "
-    "on Debian 12 apt-get install -t bookworm-backports mesa-vulkan-drivers"
-)
 
 
 class Problem(Exception):
@@ -101,8 +97,6 @@ def checks() -> Iterator[Check]:
         yield Check("settlers", partial(_any_of, {name: settlers[name] for name in installed}), fix, "fail")
     if find_spec("embreex"):
         yield Check("embree", partial(_probe, engines.EMBREE), f"{_AGAIN} embreex", "fail")
-    if find_spec("sapien"):
-        yield Check("sapien render device", partial(_probe, engines.SAPIEN_RENDER), _MESA_FIX)
     if find_spec("ray"):
         yield Check("ray", partial(_probe, engines.RAY), f"{_AGAIN} ray; or use --workers 0.")
     if not EXTRAS["sim"].missing():

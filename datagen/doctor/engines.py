@@ -20,14 +20,6 @@ assert actor.pose.p[2] < 1.0, "the cube does not fall"
 print("sapien " + importlib.metadata.version("sapien") + ", a cube falls")
 """
 
-# Without a device, creating the render system fails.
-SAPIEN_RENDER = """
-import importlib
-sapien = importlib.import_module("sapien")
-system = sapien.render.RenderSystem()
-print(system.device.name)
-"""
-
 PYBULLET = """
 import importlib, importlib.metadata
 p = importlib.import_module("pybullet")
@@ -109,8 +101,3 @@ def probe(code: str, timeout_s: float = _DEADLINE_S) -> Probe:
         return Probe(False, f"crashed with {signal.Signals(-done.returncode).name}")
     said = (done.stderr if done.returncode else done.stdout).strip().splitlines()
     return Probe(done.returncode == 0, said[-1][:200] if said else f"exit code {done.returncode}")
-
-
-def probe_render_device() -> Probe:
-    """Probe for the render device of SAPIEN: its name, or why there is none."""
-    return probe(SAPIEN_RENDER)

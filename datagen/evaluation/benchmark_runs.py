@@ -65,6 +65,6 @@ def make_runs(
     for name, wanted in runs.items():
         run = Run.create_or_open(open_storage(out / name), manifests[name], wanted.n)
         given = Sources(houses=houses, objects=objects[wanted.objects])
-        job_run = open_job_run(run, given, options.address)
+        job_run = open_job_run(run, given)
         job = Job(run.storage, str(out / name), [job_run], options, time.monotonic(), words, words)
         yield job.run()

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from datagen.console.options import AssetSources
 from datagen.evaluation.arrival_outcomes import Arrived, SceneTask, read_outcomes, scene_generator
@@ -188,33 +187,21 @@ def _distinct(candidates: Sequence[I64], offsets: F64) -> tuple[Arrived, ...]:
 
 
 def loop_record(loop: Loop, methods: Sequence[Method]) -> dict[str, Any]:
-    """The numbers of a loop whose arrivals are all made, over all scenes and over the hard ones.
-
-    `agreement` compares the outcomes of distinct arrivals with the labels around them.
-    """
+    """The numbers of a loop whose arrivals are all made, over all scenes and over the hard ones."""
     known = [read_outcomes(task.path) for task in loop.tasks]
-    keys = {
-        pick: [
-            [[each.key for each in _arrived(c, loop.offsets[e, k])] for k, c in enumerate(row)]
-            for e, row in enumerate(candidates_of(loop.maps, cells).tolist())
-        ]
-        for pick, cells in loop.cells.items()
-    }
     outcomes = {
         pick: np.array(
-            [[[known[k][key] for key in each] for k, each in enumerate(row)] for row in rows], object
+            [
+                [[known[k][each.key] for each in _arrived(c, loop.offsets[e, k])] for k, c in enumerate(row)]
+                for e, row in enumerate(candidates_of(loop.maps, cells).tolist())
+            ],
+            object,
         )
-        for pick, rows in keys.items()
-    }
-    labels = {
-        pick: label_success(loop.columns, loop.maps, cells, loop.offsets)
         for pick, cells in loop.cells.items()
     }
     weights = weights_for(loop.columns, RESAMPLES, SEED)
     _, hard = mixed_grids(loop.columns)
-    table = partial(
-        loop_table, outcomes, {p: each[1] for p, each in labels.items()}, loop.arrivals, methods, weights
-    )
+    table = partial(loop_table, outcomes, loop.arrivals, methods, weights)
     sides = {"all": np.ones(len(hard), np.bool_), "hard": hard}
     return {
         "mode": loop.mode,
@@ -230,37 +217,11 @@ def loop_record(loop: Loop, methods: Sequence[Method]) -> dict[str, Any]:
             for name, rows in sides.items()
             if rows.any()
         ],
-        "agreement": [
-            {"arrival": arrival.text}
-            | _agreement({pick: rows[e] for pick, rows in keys.items()}, outcomes, labels, e)
-            for e, arrival in enumerate(loop.arrivals)
-        ],
     }
-
-
-def label_success(columns: Columns, maps: GridMaps, cells: I64, offsets: F64) -> tuple[F64, F64]:
-    """Success (E, S, D) of each arrival by the labels around it: of the nearest cell, and bilinear.
-
-    It is 0 off the grid.
-    """
-    scene = np.arange(len(maps.order))
-    xy = columns.base_xy_m.astype(np.float64)[maps.order.reshape(len(scene), -1)]  # (S, Y * X, 2)
-    goal = xy[scene, cells][:, :, None]  # (E, S, 1, 2)
-    headings = columns.base_yaw_rad.astype(np.float64)[maps.order.reshape(len(scene), -1)]
-    yaw = headings[scene, cells][:, :, None]
-    x = goal[..., 0] + np.cos(yaw) * offsets[..., 0] - np.sin(yaw) * offsets[..., 1] - xy[:, 0, 0][:, None]
-    y = goal[..., 1] + np.sin(yaw) * offsets[..., 0] + np.cos(yaw) * offsets[..., 1] - xy[:, 0, 1][:, None]
-    where = [np.broadcast_to(scene[:, None], x.shape).astype(np.float64), y / maps.step_m, x / maps.step_m]
-    nearest, bilinear = (
-        np.asarray(ndimage.map_coordinates(maps.truth, where, order=order, mode="constant"), np.float64)
-        for order in (0, 1)
-    )
-    return nearest, bilinear
 
 
 def loop_table(
     outcomes: Mapping[Pick, Names],
-    by_labels: Mapping[Pick, F64],
     arrivals: Sequence[Arrival],
     methods: Sequence[Method],
     weights: Weights,
@@ -268,9 +229,8 @@ def loop_table(
 ) -> list[dict[str, Any]]:
     """Success of every pick for each arrival error over some of the S scenes, with intervals over scenes.
 
-    `outcomes` are keys of OUTCOMES, `by_labels` success by labels (E, S, D); `weights` (B, S) resample the
-    scenes. `gains` are paired differences of smoothed and nominal picks, `comparisons` those of methods'
-    smoothed picks.
+    `outcomes` are keys of OUTCOMES; `weights` (B, S) resample the scenes. `gains` are paired differences of
+    smoothed and nominal picks, `comparisons` those of methods' smoothed picks.
     """
     found: list[dict[str, Any]] = []
     for e, arrival in enumerate(arrivals):
@@ -283,7 +243,6 @@ def loop_table(
             shares = sorted(zip((count / ends.size).tolist(), causes.tolist(), strict=True), reverse=True)
             results.setdefault(name, {})[pick] = {
                 **rate.values(),
-                "by_labels": float(by_labels[name, pick][e, scenes].mean()),
                 "failures": {cause: share for share, cause in shares},
             }
         of_methods = {m.name: rates[m.name] for m in methods}
@@ -310,27 +269,3 @@ def _rate(success: npt.NDArray[Any], scenes: Bools, weights: Weights) -> Estimat
     whole, drawn = parts.sum(axis=0), summed(weights, parts)
     with np.errstate(invalid="ignore"):  # a resample of few scenes may hold none of these
         return Estimate(float(whole[0] / whole[1]), drawn[:, 0] / drawn[:, 1], int(scenes.sum()))
-
-
-def _agreement(
-    keys: Mapping[Pick, list[list[str]]],
-    outcomes: Mapping[Pick, Names],
-    labels: Mapping[Pick, tuple[F64, F64]],
-    error: int,
-) -> dict[str, Any]:
-    """The prediction of nearby labels for the distinct arrivals of one error, and their outcomes."""
-    seen: dict[tuple[int, str], tuple[bool, float, float]] = {}
-    for pick, rows in keys.items():
-        nearest, bilinear = labels[pick]
-        for k, of_scene in enumerate(rows):
-            for d, key in enumerate(of_scene):
-                at = (error, k, d)
-                seen[k, key] = (outcomes[pick][at] == "success", float(nearest[at]), float(bilinear[at]))
-    made, near, between = np.array(list(seen.values()), np.float64).T
-    return {
-        "distinct": len(seen),
-        "success": float(made.mean()),
-        "nearest_label": float(near.mean()),
-        "bilinear_label": float(between.mean()),
-        "agree_with_nearest": float((made == near).mean()),
-    }

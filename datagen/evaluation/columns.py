@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.train.inputs import F32, F64, I64, U8, Array, Batch, Bools
+from datagen.train.inputs import F32, F64, I64, Array, Batch, Bools
 from datagen.train.scorers import Scorer, scored
 from datagen.workers.bases.candidate_sets import in_set
 
 # Further columns of a batch that the evaluation needs.
 EXTRA = (
-    *("base_yaw_rad", "base_is_clear", "distance_m", "mount_distance_m", "visibility", "outcome"),
-    *("house_id", "object_name", "object_digest", "scene_index"),
+    *("base_yaw_rad", "base_is_clear", "distance_m", "mount_distance_m"),
+    *("house_id", "object_name", "scene_index"),
 )
 
 
@@ -29,17 +29,14 @@ class Columns:
     robot: I64  # (N,)
     label: Bools  # (N,)
     is_clear: Bools  # (N,)
-    outcome: U8  # (N,) codes of OUTCOMES
     base_xy_m: F32  # (N, 2), target frame
     base_yaw_rad: F32  # (N,), world, whose axes the target frame has
     distance_m: F32  # (N,)
     mount_distance_m: F32  # (N,)
     reach_m: F32  # (N,)
-    visibility: F32  # (N,)
     scores: Mapping[str, F64]  # (N,) each
     house: Array  # (S,) text
     target: Array  # (S,) text
-    target_digest: Array  # (S,) text
     run: I64  # (S,) index of the run
     is_grid: Bools  # (S,) whether it has all cells of a grid, for one robot
 
@@ -75,7 +72,7 @@ class Columns:
         return in_set(candidates, self.is_clear, self.mount_distance_m, self.reach_m)
 
 
-_SCENE_COLUMNS = ("house", "target", "target_digest", "run", "is_grid")
+_SCENE_COLUMNS = ("house", "target", "run", "is_grid")
 
 
 def gather(
@@ -116,13 +113,9 @@ def _rows(batch: Batch[Array], first_scene: int, first_robot: int) -> dict[str, 
         "robot": first_robot + robot,
         "label": batch.label == 1,
         "is_clear": batch.extra["base_is_clear"].astype(np.bool_),
-        "outcome": batch.extra["outcome"],
         "base_xy_m": batch.candidates.base_xy_m,
         "reach_m": batch.robots.arm_reach_m[robot],
-        **{
-            name: batch.extra[name]
-            for name in ("base_yaw_rad", "distance_m", "mount_distance_m", "visibility")
-        },
+        **{name: batch.extra[name] for name in ("base_yaw_rad", "distance_m", "mount_distance_m")},
     }
 
 
@@ -133,7 +126,6 @@ def _scenes(batch: Batch[Array], run: int, cells: int) -> dict[str, Array]:
     return {
         "house": batch.extra["house_id"],
         "target": batch.extra["object_name"][:, 0],
-        "target_digest": batch.extra["object_digest"][:, 0],
         "run": np.full(n, run, np.int64),
         "is_grid": (robots == 1) & (candidates == cells) & (cells > 0),
     }

@@ -1,4 +1,4 @@
-"""Figures of an evaluation: intervals, curves, success on arrival, and whole grids of a few scenes."""
+"""Figures of an evaluation: intervals, success on arrival, and whole grids of a few scenes."""
 
 from __future__ import annotations
 
@@ -39,11 +39,6 @@ _LOOP_TITLES = {
 _APART_CM = 0.12  # between two methods, so that their intervals do not hide each other
 INTERVALS_CAPTION = (
     "Each method with its interval; a black bar is the accuracy in the paper, a dotted line chance."
-)
-CURVES_CAPTION = (
-    "Left: rates over all thresholds, with the area under the curve in brackets. Right: observed share of "
-    "good candidates by mean predicted probability, with the Brier score in brackets; larger dots have more "
-    "candidates."
 )
 LOOP_CAPTION = "Success where the robot arrives off its pick and plans from there, with intervals by scene."
 GRIDS_CAPTION = (
@@ -97,38 +92,6 @@ def _draw_estimate(ax: Axes, y: int, estimate: Report, look: dict[str, Any]) -> 
     if estimate["low"] is not None and estimate["high"] is not None:
         ax.plot([100 * estimate["low"], 100 * estimate["high"]], [y, y], color=look["color"], lw=3, alpha=0.5)
     ax.plot(100 * estimate["value"], y, look["marker"], color=look["color"], mec="white", mew=0.6, ms=8)
-
-
-def draw_curves(report: Report, scores: Report) -> Figure:
-    """Draw ROC and reliability curves of every method side by side."""
-    records = report["methods"]
-    figure = new_figure(12, 6.2)
-    roc, reliability = figure.subplots(1, 2)
-    looks = _looks_of(records)
-    for k, record in enumerate(records):
-        name = record["name"]
-        # Each curve has its markers at other positions, so that they do not hide each other.
-        look = looks[name] | {"ms": 6, "mec": "white", "mew": 0.5}
-        spread = look | {"markevery": (0.02 + 0.14 * (k % 8) / 8, 0.14)}
-        curve, values = scores["roc"][name], scores["methods"][name]
-        area = values["area_under_roc"]["value"]
-        roc.plot(curve["x"], curve["y"], **spread, label=f"{plain(name)} ({area:.2f})")
-        if bins := values["reliability"]:
-            predicted, observed = ([each[key] for each in bins] for key in ("said", "true"))
-            reliability.plot(predicted, observed, **look, label=f"{plain(name)} ({values['brier']:.3f})")
-            most = max(each["count"] for each in bins)
-            area_pt2 = [14 + 160 * each["count"] / most for each in bins]
-            style = {"color": look["color"], "marker": look["marker"], "alpha": 0.7}
-            reliability.scatter(predicted, observed, s=area_pt2, **style)
-    for ax, title, x, y in (
-        (roc, "ROC (area under the curve)", "false positive rate", "true positive rate"),
-        (reliability, "reliability (Brier score)", "mean predicted probability", "observed share of good"),
-    ):
-        ax.plot([0, 1], [0, 1], color="#999999", lw=0.8, ls=":")
-        ax.set(title=title, xlabel=x, ylabel=y, xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
-        if ax.get_legend_handles_labels()[1]:
-            ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.12), frameon=False, ncols=2)
-    return figure
 
 
 def draw_loop(report: Report) -> Figure:

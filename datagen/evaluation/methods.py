@@ -153,7 +153,6 @@ def baseline_methods(
     requested: Sequence[str] | None,
     fit: Sequence[str],
     runs: Sequence[EvaluatedRun],
-    detector: Path | None = None,
     heuristic: HeuristicParams | None = None,
     allow_seen_houses: bool = False,
     json: bool = False,
@@ -175,7 +174,7 @@ def baseline_methods(
     specs += [run.manifest.spec for path in fit for run in open_runs(path)]
     arms = [spec.arm for spec in specs if spec.arm is not None]
     robots = tuple(dict.fromkeys(arm.robot_key for arm in arms if arm.robot in ROBOTS))
-    made = make_baselines(names, detector, heuristic, SEED, robots)
+    made = make_baselines(names, heuristic, SEED, robots)
     calibrations: dict[str, Calibration] = {}
     houses: frozenset[str] = frozenset()
     if fit:
@@ -200,14 +199,9 @@ def baseline_methods(
             name = next(iter(unfitted))
             raise InputError("--baselines", name, why, "Name runs in validation houses with --fit")
         made = [b for b in made if not b.needs_fit]
-    # The note of a method follows its name in brackets.
-    named = [(b, *b.name.partition(" (")[::2]) for b in made]
     return BaselineMethods(
         tuple(
-            EvaluatedMethod(
-                name, b, state=b.state(), note=note.rstrip(")"), calibration=calibrations.get(b.name)
-            )
-            for b, name, note in named
+            EvaluatedMethod(b.name, b, state=b.state(), calibration=calibrations.get(b.name)) for b in made
         ),
         left_out,
         houses,

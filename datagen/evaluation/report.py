@@ -28,7 +28,6 @@ PAPER = {
     "accuracy": {
         "proximity": 0.4691,
         "threshold": 0.5691,
-        "threshold-detector": 0.6873,
         "stage1": 0.7675,
         "sim-only": 0.7911,
         "two-stage": 0.8413,
@@ -79,8 +78,7 @@ def evaluation_report(
     InputError where no part has a table.
     """
     judged = [each.method for each in methods]
-    objects = frozenset[str]().union(*(each.objects for each in methods))
-    made = [_part(part, judged, objects, arrivals) for part in parts]
+    made = [_part(part, judged, arrivals) for part in parts]
     if not any(part["sets"] or part["grids"] for part in made):
         (name, problem), *_ = made[0]["left_out"].items()
         raise InputError(f"{name} candidates", "", problem, "Evaluate more scenes, with labels of both kinds")
@@ -96,9 +94,7 @@ def evaluation_report(
     }
 
 
-def _part(
-    part: Part, methods: Sequence[Method], objects: frozenset[str], arrivals: Sequence[Arrival]
-) -> dict[str, Any]:
+def _part(part: Part, methods: Sequence[Method], arrivals: Sequence[Arrival]) -> dict[str, Any]:
     """The tables of one part, and the reason of each that is left out."""
     columns = part.columns
     scored: dict[str, Any] = {}
@@ -107,7 +103,7 @@ def _part(
         covered = columns.of_scenes(np.isin(columns.run, runs))
         weights = weights_for(covered, RESAMPLES, SEED)
         try:
-            scored[name] = evaluate_set(covered, methods, name, weights, objects, SEED) | {"runs": list(runs)}
+            scored[name] = evaluate_set(covered, methods, name, weights, SEED) | {"runs": list(runs)}
         except InputError as error:
             left_out[name] = error.problem
     grids = None

@@ -80,7 +80,6 @@ def blocks(report: Report, columns: Columns | None = None) -> Iterator[str | Tab
             yield next(tables)
             yield Picture(partial(figures.draw_intervals, report, scores), figures.INTERVALS_CAPTION)
             yield from tables
-            yield Picture(partial(figures.draw_curves, report, scores), figures.CURVES_CAPTION)
         if part["grids"] is not None:
             yield from grid_tables(report, part["grids"])
         yield Table("omitted", ("table", "reason"), list(part["left_out"].items()))

@@ -43,13 +43,12 @@ class Table:
 
 
 def set_tables(report: Report, scores: Report) -> Iterator[Table]:
-    """The tables of one candidate set: methods, differences, reach, choices, and groups of candidates."""
+    """The tables of one candidate set: methods, differences, reach and choices."""
     yield _accuracy(report, scores)
     yield from comparison_tables(scores["comparisons"], scores["candidates"])
     if scores["out_of_reach"]["count"]:
         yield _reach(report, scores)
     yield _choice(report, scores)
-    yield from _breakdown(report, scores)
 
 
 def _accuracy(report: Report, scores: Report) -> Table:
@@ -121,23 +120,6 @@ def _choice(report: Report, scores: Report) -> Table:
     return Table(f"choosing among a robot's candidates ({scores['candidates']})", heads, rows)
 
 
-def _breakdown(report: Report, scores: Report) -> Iterator[Table]:
-    names = [record["name"] for record in models_first(report["methods"])]
-    for heading in dict.fromkeys(row["by"] for row in scores["breakdown"]):
-        rows = [
-            (
-                row["group"],
-                f"{row['count']:,}",
-                percent(row["positives"] / row["count"]),
-                *(percent(row["methods"][name]["accuracy"]) for name in names),
-            )
-            for row in scores["breakdown"]
-            if row["by"] == heading
-        ]
-        title = f"accuracy by {heading} ({scores['candidates']}), in %"
-        yield Table(title, (heading, "count", "good (%)", *names), rows, detail=True)
-
-
 def grid_tables(report: Report, grids: Report) -> Iterator[Table]:
     """Table III, picks and the order of a grid's cells, with their comparisons and success on arrival."""
     methods = [(r["name"], grids["methods"][r["name"]], f"{r['seconds_per_600']:.2g}")
@@ -182,7 +164,7 @@ def _arrivals(report: Report, found: Sequence[Report]) -> Table:
 
 
 def loop_tables(report: Report) -> Iterator[Table]:
-    """The tables of the closed loop: success, gain of smoothing, best methods, causes, and agreement."""
+    """The tables of the closed loop: success, gain of smoothing, best methods, and causes."""
     loop = report["closed_loop"]
     names = [method["name"] for method in models_first(report["methods"])] + [BY_LABELS, AT_RANDOM]
     for part in loop["parts"]:
@@ -222,18 +204,6 @@ def loop_tables(report: Report) -> Iterator[Table]:
         for pick, result in row["methods"][name].items()
     ]
     yield Table(f"failures (% of arrivals, {row['arrival']})", ("method", "pick", "cause"), causes)
-    shares = {
-        "success": "success (%)",
-        "nearest_label": "by nearest label (%)",
-        "bilinear_label": "between labels (%)",
-        "agree_with_nearest": "agree with nearest (%)",
-    }
-    agreement = [
-        (row["arrival"], f"{row['distinct']:,}", *(percent(row[key]) for key in shares))
-        for row in loop["agreement"]
-    ]
-    title = "agreement with the labels around each arrival"
-    yield Table(title, ("arrival", "distinct arrivals", *shares.values()), agreement, detail=True)
 
 
 def notes(report: Report) -> list[tuple[str, str]]:

@@ -5,7 +5,7 @@ Values are None where undefined; intervals come from `datagen.train.bootstrap`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,25 +20,20 @@ from datagen.evaluation.comparisons import (
 )
 from datagen.evaluation.grids import picks, select
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import OUTCOMES
 from datagen.train import metrics
 from datagen.train.bootstrap import (
     Estimate,
     Weights,
-    finite,
     resample_weights,
     resampled_area_under_roc,
     summed,
 )
 from datagen.train.inputs import F64, Bools
-from datagen.workers.bases.candidate_sets import DISTANCE_EDGES_M, VISIBILITY_EDGES, Edges, Floats, bands
 
-_CURVE_POINTS = 200
 # In order of the report, which compares methods by each.
 METRICS = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick", "mean_average_precision")
 GRID_METRICS = ("good", "mean_average_precision")
 _OF_CONFUSIONS = {"accuracy": metrics.accuracy, "balanced_accuracy": metrics.balanced_accuracy}
-_RATIO_EDGES: Edges = (0.0, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, None)
 
 
 def evaluate_set(
@@ -46,7 +41,6 @@ def evaluate_set(
     methods: Sequence[Method],
     candidates: str,
     weights: Weights,
-    trained_objects: Collection[str] = (),
     seed: int = 0,
 ) -> dict[str, Any]:
     """Return the report of one candidate set; `weights` (B, S) resample the scenes of `columns`.
@@ -78,18 +72,6 @@ def evaluate_set(
             for m in methods
         },
         **_over_seeds(estimates, methods, METRICS, seed),
-        "roc": {m.name: _roc(columns.label, columns.scores[m.name]) for m in methods},
-        "breakdown": [
-            {
-                "by": heading,
-                "group": name,
-                "count": int(rows.sum()),
-                "positives": int(columns.label[rows].sum()),
-                "methods": {name: _accuracies(d[rows], columns.label[rows]) for name, d in decisions.items()},
-            }
-            for heading, members in groups_of(columns, trained_objects).items()
-            for name, rows in members
-        ],
     }
 
 
@@ -191,51 +173,10 @@ def weights_for(columns: Columns, n_resamples: int, seed: int) -> Weights:
 def _calibration(columns: Columns, method: Method) -> dict[str, Any]:
     score, true = columns.scores[method.name], columns.label
     if not method.gives_probabilities:
-        return {"brier": None, "expected_calibration_error": None, "reliability": None}
-    bins = metrics.reliability(true, score)
-    rows = zip(bins.count.tolist(), bins.predicted.tolist(), bins.true.tolist(), strict=True)
-    return {
-        "brier": metrics.brier(true, score),
-        "expected_calibration_error": bins.expected_error,
-        "reliability": [{"count": c, "said": p, "true": t} for c, p, t in rows],
-    }
-
-
-def _roc(true: Bools, score: F64) -> dict[str, list[float]]:
-    curve = metrics.roc(true, score).thinned(_CURVE_POINTS)
-    return {"x": curve.x.round(6).tolist(), "y": curve.y.round(6).tolist()}
+        return {"brier": None, "expected_calibration_error": None}
+    error = metrics.expected_calibration_error(true, score)
+    return {"brier": metrics.brier(true, score), "expected_calibration_error": error}
 
 
 def _class_counts(columns: Columns, rows: Bools) -> dict[str, int]:
     return {"count": int(rows.sum()), "positives": int(columns.label[rows].sum())}
-
-
-def _accuracies(decisions: F64, true: Bools) -> dict[str, float | None]:
-    counts = metrics.confusion(decisions, true, np.zeros(len(true), np.int64), 1)[0]
-    return {name: finite(float(metric(counts))) for name, metric in _OF_CONFUSIONS.items()}
-
-
-def groups_of(columns: Columns, trained_objects: Collection[str]) -> dict[str, list[tuple[str, Bools]]]:
-    """Groups of candidates for the breakdown: heading -> names with masks (N,); none is empty."""
-    ratio = columns.mount_distance_m.astype(np.float64) / columns.reach_m
-    seen = np.isin(columns.target_digest.astype(str), np.array(sorted(trained_objects), str))
-    target = columns.target.astype(str)
-    return {
-        "object": [(name, (target == name)[columns.scene]) for name in np.unique(target[columns.scene])],
-        "distance (m)": _named_bands(columns.distance_m, DISTANCE_EDGES_M),
-        "mount distance / reach": _named_bands(ratio, _RATIO_EDGES),
-        "visibility": _named_bands(columns.visibility, VISIBILITY_EDGES),
-        "outcome": [
-            (name, rows) for code, name in enumerate(OUTCOMES) if (rows := columns.outcome == code).any()
-        ],
-        **({"object trained on": _yes_no(seen[columns.scene])} if trained_objects else {}),
-    }
-
-
-def _named_bands(values: Floats, edges: Edges) -> list[tuple[str, Bools]]:
-    found = bands(values, edges)
-    return [(f"{low:g} on" if high is None else f"{low:g} to {high:g}", rows) for low, high, rows in found]
-
-
-def _yes_no(rows: Bools) -> list[tuple[str, Bools]]:
-    return [(name, part) for name, part in (("yes", rows), ("no", ~rows)) if part.any()]

@@ -17,7 +17,6 @@ from datagen.console.command_lines import (
     words_of,
 )
 from datagen.console.options import AS_FOUND, Sources
-from datagen.doctor.engines import probe_render_device
 from datagen.jobs.job import JobOptions, JobRun
 from datagen.replaying import open_sources, places_of
 from datagen.schemas.errors import InputError
@@ -25,6 +24,7 @@ from datagen.schemas.run import Run
 from datagen.schemas.specification import Specification
 from datagen.workers.engine_versions import refuse_other_engines
 from datagen.workers.labels import load_label_source
+from datagen.workers.rendering import load_renderer
 from datagen.workers.robots import coordinates_of
 
 Options = TypeVar("Options", bound=Any)  # a dataclass of options
@@ -58,7 +58,7 @@ def words_to_resume(path: str, options: JobOptions, moved: Sources = AS_FOUND) -
     return ["resume", absolute_path(path), *words_of(sources | where)]
 
 
-def open_job_run(run: Run, given: Sources, address: str) -> JobRun:
+def open_job_run(run: Run, given: Sources) -> JobRun:
     """Return an existing run with its sources, after a check that they are those it was made from.
 
     InputError where they are missing or differ, or where another version of an engine is installed: new
@@ -73,7 +73,7 @@ def open_job_run(run: Run, given: Sources, address: str) -> JobRun:
         raise InputError("--scenes-from", given.scenes_from, problem, "Omit --scenes-from")
     refuse_other_engines(f"{run.storage.url}/manifest.json", spec)
     open_sources(run, given)
-    refuse_unusable_engines(spec, address)
+    refuse_unusable_engines(spec)
     houses, objects, robot = places_of(run, given)
     return JobRun(
         run,
@@ -84,7 +84,7 @@ def open_job_run(run: Run, given: Sources, address: str) -> JobRun:
     )
 
 
-def refuse_unusable_engines(spec: Specification, address: str) -> None:
+def refuse_unusable_engines(spec: Specification) -> None:
     """Raise InputError for a robot or a renderer that does not work on this machine."""
     if spec.arm is not None:
         count = coordinates_of(spec.arm.robot_key)
@@ -92,8 +92,5 @@ def refuse_unusable_engines(spec: Specification, address: str) -> None:
             problem = f"moves {count} joints here, and {spec.arm.joints or 7} in the run"
             fix = "Start a new run, or use the version of the program that the run was made with"
             raise InputError("--robot", spec.arm.robot, problem, fix)
-    if address == "local" and spec.scenes_from is None and spec.observation.renderer == "sapien":
-        device = probe_render_device()
-        if not device.succeeded:
-            problem, fix = f"finds no render device ({device.text})", "Use embree, or see `datagen doctor`"
-            raise InputError("observation.renderer", "sapien", problem, fix)
+    if spec.scenes_from is None:
+        load_renderer(spec.observation.renderer)

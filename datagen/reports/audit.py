@@ -1,4 +1,4 @@
-"""The audit of runs as plain values: what was made, its cost, the waste, and the cost of the paper's labels.
+"""The audit of runs as plain values: what was made, its cost and the waste.
 
 CPU seconds are measured for a shard, not for a candidate. The whole cost of a run, waste included, is divided
 by the number of labels of a kind: candidates whose base collides or that are beyond reach cost almost nothing
@@ -16,11 +16,6 @@ from datagen.reports.spending import Account, Spending, account_for
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import STAGES
 
-# GBPP: 180,000 distance-visibility labels in under three days on one RTX A5000, and over three weeks
-# for as many simulated ones.
-PAPER_LABELS = 180_000
-PAPER_DAYS = {"heuristic": 3.0, "sim": 21.0}
-_DAY_S = 86400.0
 _SCENE_STAGES = ("draw", "settle", "observe")
 
 
@@ -70,7 +65,6 @@ def _source(
         "positive_within_reach": near_positive,
         "scene": spending.scenes,
     }
-    per = {name: total / count if count else None for name, count in counts.items()}
     return {
         "label_source": source,
         "made_from": "; ".join(dict.fromkeys(each.run.manifest.made_from for each in labels)),
@@ -80,7 +74,7 @@ def _source(
         "total_core_s": total,
         "includes_scenes": scenes_s is not None,
         "wall_s": useful.wall_s + wasted.wall_s,
-        "core_s_per": per,
+        "core_s_per": {name: total / count if count else None for name, count in counts.items()},
         "attempts": useful.attempts + wasted.attempts,
         "waste": {kind: _plain(account) for kind, account in sorted(spending.waste.items())},
         "causes": {
@@ -91,7 +85,6 @@ def _source(
         "stored_bytes": useful.written_bytes,
         "peak_rss_bytes": useful.peak_rss_bytes,
         "machines": dict(spending.machines),
-        "projection": _projection(source, per, useful.written_bytes, spending.labels),
     }
 
 
@@ -109,19 +102,6 @@ def _scenes_s(group: Sequence[Labels], runs: Sequence[Run]) -> float | None:
         made_s = fsum(maker.useful.stage_s[stage] for stage in _SCENE_STAGES)
         total += made_s * spending.scenes / maker.scenes if maker.scenes else 0.0
     return total
-
-
-def _projection(source: str, per: Mapping[str, float | None], stored: int, labels: int) -> dict[str, Any]:
-    def days(each_s: float | None) -> float | None:
-        return None if each_s is None else each_s * PAPER_LABELS / _DAY_S
-
-    return {
-        "labels": PAPER_LABELS,
-        "core_days": days(per["label"]),
-        "core_days_within_reach": days(per["label_within_reach"]),
-        "bytes": stored * PAPER_LABELS / labels if labels else None,
-        "paper_gpu_days": PAPER_DAYS.get(source),
-    }
 
 
 def _plain(account: Account) -> dict[str, Any]:

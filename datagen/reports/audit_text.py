@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from datagen.console.printing import counted, print_lines, print_rows, seconds, size
+from datagen.console.printing import counted, print_lines, print_rows, seconds
 
 Source = Mapping[str, Any]
 
 # Costs that are no stages.
 _ADDED = ("other", "waste", "scenes of other runs", "relabelled files")
 _STAGES_SHOWN = (5, 5, 3)  # for one, two and more label sources, so that 25 lines suffice
-_OF_PAPER = " labels, one core"
 # Rows that are printed without --full.
 _ALWAYS = (
     "labels", "  positive", "  within reach", "core time", "core time of a label",
@@ -26,10 +25,7 @@ _UNITS = {
 
 
 def print_audit(report: Mapping[str, Any], full: bool = False) -> None:
-    """Print what was made, its cost, the waste, and the cost of the paper's number of labels.
-
-    `full` adds costs by stage, rejected scenes, and the sizes and costs that only planning needs.
-    """
+    """Print what was made, its cost and the waste. `full` adds costs by stage and rejected scenes."""
     if not report["is_exact"]:
         print_lines(
             f"the ledger does not add up: {counted(report['contradictions'], 'record')} of committed"
@@ -37,11 +33,7 @@ def print_audit(report: Mapping[str, Any], full: bool = False) -> None:
         )
     sources: Sequence[Source] = report["sources"]
     title = "; ".join(dict.fromkeys(source["made_from"] for source in sources))
-    rows = [
-        row
-        for row in (*_made(sources), *cost_rows(sources))
-        if full or row[0] in _ALWAYS or row[0].endswith(_OF_PAPER)
-    ]
+    rows = [row for row in (*_made(sources), *cost_rows(sources)) if full or row[0] in _ALWAYS]
     print_rows(title, rows, ("", *(source["label_source"] for source in sources)))
     notes = [
         f"{source['label_source']}: add the run that made its scenes, whose cost is missing here"
@@ -54,8 +46,8 @@ def print_audit(report: Mapping[str, Any], full: bool = False) -> None:
 
 
 def cost_rows(sources: Sequence[Source]) -> list[tuple[str, ...]]:
-    """Rows of a name and a cell for each label source: cost, waste, cost of the paper's labels."""
-    return [*_cost(sources), *_waste(sources), *_projection(sources)]
+    """Rows of a name and a cell for each label source: cost and waste."""
+    return [*_cost(sources), *_waste(sources)]
 
 
 def _row(name: str, sources: Sequence[Source], cell: Callable[[Source], str]) -> tuple[str, ...]:
@@ -141,31 +133,6 @@ def _waste(sources: Sequence[Source]) -> list[tuple[str, ...]]:
 def _commonest(source: Source) -> str:
     found = sorted(source["rejected_scenes"].items(), key=lambda item: -item[1])[:2]
     return ", ".join(f"{cause} {count:,}" for cause, count in found) or "-"
-
-
-def _projection(sources: Sequence[Source]) -> list[tuple[str, ...]]:
-    def time(days: float | None) -> str:
-        return "-" if days is None else seconds(days * 86400)
-
-    def paper(source: Source) -> str:
-        """As the paper states it: days of one GPU, and weeks for executed grasps."""
-        days = source["projection"]["paper_gpu_days"]
-        if source["label_source"] == "sim" and days is not None:
-            return f"> {days / 7:.2g} GPU-weeks"
-        return "-" if days is None else f"< {days:.2g} GPU-days"
-
-    def stored(source: Source) -> str:
-        value = source["projection"]["bytes"]
-        return "-" if value is None else size(value)
-
-    labels = sources[0]["projection"]["labels"]
-    rows = [
-        _row(f"{labels:,}{_OF_PAPER}", sources, lambda s: time(s["projection"]["core_days"])),
-        _row("  within reach", sources, lambda s: time(s["projection"]["core_days_within_reach"])),
-        _row("  in the paper", sources, paper),
-        _row("  stored", sources, stored),
-    ]
-    return [row for row in rows if set(row[1:]) != {"-"}]
 
 
 def _costliest(sources: Sequence[Source]) -> list[tuple[str, Mapping[str, Any]]]:

@@ -5,11 +5,9 @@ A decision is 0 or 1, or 1/k for each of k candidates with the same best score.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from datagen.train.inputs import F64, I64, Bools, Ints
+from datagen.train.inputs import F64, Bools, Ints
 
 N_BINS = 10
 
@@ -37,23 +35,6 @@ def ratio(part: F64, whole: F64) -> F64:
     return np.divide(part, whole, out=np.full(np.shape(whole), np.nan), where=whole > 0)
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """Points (K,) of a curve in order; equal scores give one point, since no threshold separates them."""
-
-    x: F64
-    y: F64
-
-    def thinned(self, most: int) -> Curve:
-        """At most `most` of the points, evenly along the curve, both ends among them."""
-        if len(self.x) <= most:
-            return self
-        along = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.x)) + np.abs(np.diff(self.y)))])
-        rows = np.unique(np.searchsorted(along, np.linspace(0, along[-1], most)).clip(max=len(along) - 1))
-        rows[-1] = len(along) - 1
-        return Curve(self.x[rows], self.y[rows])
-
-
 def _steps(true: Bools, score: F64) -> tuple[F64, F64]:
     """True and false positives (K,) at thresholds of all distinct scores, the highest first."""
     order = np.argsort(-score, kind="stable")
@@ -63,20 +44,12 @@ def _steps(true: Bools, score: F64) -> tuple[F64, F64]:
     return positives.astype(np.float64), (last_of_ties + 1 - positives).astype(np.float64)
 
 
-def roc(true: Bools, score: F64) -> Curve:
-    """ROC curve: false (x) and true (y) positive rates. Needs both classes."""
-    positives, negatives = _steps(true, score)
-    return Curve(
-        np.concatenate([[0.0], negatives / negatives[-1]]), np.concatenate([[0.0], positives / positives[-1]])
-    )
-
-
 def area_under_roc(true: Bools, score: F64) -> float:
     """Area under the ROC curve, ties counting half; nan with one class."""
     if not len(true) or true.all() or not true.any():
         return float("nan")
-    curve = roc(true, score)
-    return float(np.trapezoid(curve.y, curve.x))
+    found, wrong = (np.append(0.0, count / count[-1]) for count in _steps(true, score))
+    return float(np.trapezoid(found, wrong))
 
 
 def average_precision(true: Bools, score: F64) -> float:
@@ -88,27 +61,11 @@ def average_precision(true: Bools, score: F64) -> float:
     return float(np.sum(added * (positives / (positives + negatives))))
 
 
-@dataclass(frozen=True, eq=False)
-class Reliability:
-    """Bins (K,) of predictions: count, mean prediction, observed rate."""
-
-    count: I64
-    predicted: F64
-    true: F64
-
-    @property
-    def expected_error(self) -> float:
-        """Expected calibration error: count-weighted distance of mean prediction and observed rate."""
-        return float(np.average(np.abs(self.predicted - self.true), weights=self.count))
-
-
-def reliability(true: Bools, probability: F64) -> Reliability:
-    """Non-empty bins of [0, 1] of equal width; the last includes 1."""
+def expected_calibration_error(true: Bools, probability: F64) -> float:
+    """Mean distance of mean prediction and observed rate over equal bins, weighted by count."""
     row = np.minimum((probability * N_BINS).astype(np.int64), N_BINS - 1)
-    count = np.bincount(row, minlength=N_BINS)
-    held = count > 0
-    predicted, rate = (np.bincount(row, values, N_BINS)[held] / count[held] for values in (probability, true))
-    return Reliability(count[held], predicted, rate)
+    said, seen = (np.bincount(row, values, N_BINS) for values in (probability, true))
+    return float(np.abs(said - seen).sum() / len(true))
 
 
 def brier(true: Bools, probability: F64) -> float:

@@ -63,12 +63,11 @@ EXTRAS: dict[str, Extra] = {
             **_PICTURES,
         },
     ),
-    "detect": Extra("the baseline with an object detector", {"transformers": "transformers"}),
     "cluster": Extra("workers of Ray: several processes, several machines", {"ray": "ray"}),
     "tables": Extra(
         "open_dataset and candidates: xarray and pandas", {"pandas": "pandas", "xarray": "xarray"}
     ),
-    "pybullet": Extra("a second settler and renderer", {"pybullet": "pybullet"}),
+    "pybullet": Extra("a second settler", {"pybullet": "pybullet"}),
 }
 
 

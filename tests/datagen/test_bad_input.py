@@ -90,17 +90,13 @@ def test_a_bad_option(
     assert not places["out"].exists() and not places["missing"].exists()
 
 
-def test_a_missing_render_device_is_reported_before_a_run_exists(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("sapien", reason="SAPIEN cannot be imported here", exc_type=ImportError)
-    for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
-        monkeypatch.setenv(name, "/nowhere.json")
+@pytest.mark.parametrize("renderer", ["sapien", "tests.none:render"])
+def test_an_unknown_renderer(renderer: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = tmp_path / "config.toml"
-    config.write_text("[observation]\nrenderer = 'sapien'\n")
+    config.write_text(f"[observation]\nrenderer = '{renderer}'\n")
     out = tmp_path / "out"
     arguments = ["submit", "heuristic", "--n", "16", "--out", str(out), "--config", str(config)]
-    refused(arguments, capsys, "observation.renderer", "no render device", "embree", "datagen doctor")
+    refused(arguments, capsys, "observation.renderer", renderer, "unknown", "embree")
     assert not out.exists()
 
 

@@ -128,7 +128,7 @@ def test_the_base_keeps_runs_and_names_what_it_lacks(wheel: Path, copied: Path, 
 
 def test_labels_are_made_and_shown_without_ray_and_torch(wheel: Path, tmp_path: Path) -> None:
     labels, run, other = Installed(wheel, tmp_path, "labels"), tmp_path / "run", tmp_path / "other"
-    *made, no_ray, no_cluster, no_sim, no_settler, no_renderer = labels.run(
+    *made, no_ray, no_cluster, no_sim, no_settler = labels.run(
         submit_arguments(run, PER_SCENE),
         ["show", run, "--scene", "0", "--out", tmp_path / "scene.png"],
         ["verify", run, "--replay", "1"],
@@ -137,16 +137,13 @@ def test_labels_are_made_and_shown_without_ray_and_torch(wheel: Path, tmp_path: 
         ["resume", run, "--detach"],
         ["submit", "plan", "--n", "48", "--workers", "0", "--out", other],
         submit_arguments(other, PER_SCENE, config="[settle]\nengine = 'pybullet'\n"),
-        submit_arguments(tmp_path / "third", PER_SCENE, config="[observation]\nrenderer = 'pybullet'\n"),
     )
     for done in made:
         assert done.code == 0, done
     line = refused_line(no_ray)
     assert line.startswith("error: ray: is not installed. Install the extra cluster: ")
     assert "or work in this process: --workers 0" in line
-    for extra, done in (
-        ("cluster", no_cluster), ("sim", no_sim), ("pybullet", no_settler), ("pybullet", no_renderer)
-    ):  # fmt: skip
+    for extra, done in (("cluster", no_cluster), ("sim", no_sim), ("pybullet", no_settler)):
         labels.assert_lacks(extra, done)
     assert not other.exists()
 

@@ -15,8 +15,9 @@ from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_scene
 from datagen.train.reader import SampleReader
+from datagen.workers.rendering import RENDERERS
 from tests.refusals import refused
-from tests.small_runs import HERE, PER_SCENE, arrays_of, assert_equal_runs, make_small_run
+from tests.small_runs import CONFIG, HERE, PER_SCENE, arrays_of, assert_equal_runs, make_small_run
 
 YAW = "base_yaw_rad"
 
@@ -87,3 +88,20 @@ def test_its_scenes_are_labelled_again(older: Path, tmp_path: Path) -> None:
     assert cli.run(["relabel", str(older), "--out", str(ruled), "--tau", "0.5"]) == 0
     for run in (again, ruled):
         assert cli.run(["verify", str(run), "--replay", "1"]) == 0
+
+
+def test_a_run_of_a_renderer_that_is_gone_is_read_but_neither_resumed_nor_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("sapien", reason="SAPIEN cannot be imported here", exc_type=ImportError)
+    run, config = tmp_path / "run", CONFIG.replace("[observation]\n", "[observation]\nrenderer = 'sapien'\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(RENDERERS, "sapien", RENDERERS["embree"])
+        make_small_run(run, PER_SCENE, config=config)
+    gone = ("observation.renderer: sapien: is unknown", "embree")
+    refused(["resume", str(run), "--n", str(2 * PER_SCENE), *HERE], capsys, *gone)
+    refused(["show", str(run), "--scene", "0", "--out", str(tmp_path / "scene.png")], capsys, *gone)
+    for verb in ("status", "audit", "verify"):
+        assert cli.run([verb, str(run)]) == 0
+    again = tmp_path / "again"
+    assert cli.run(["relabel", str(run), "--out", str(again), "--tau", "0.5"]) == 0

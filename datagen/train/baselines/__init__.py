@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 
 from datagen.schemas.errors import InputError, choices
 from datagen.schemas.specification import HeuristicParams
 from datagen.train.baselines.baseline import FIELDS, Baseline
-from datagen.train.baselines.detector import ThresholdDetector, ZeroShotDetector
 from datagen.train.baselines.reachability import Reachability
-from datagen.train.baselines.rules import Analytic, DistanceBand, Proximity, Threshold
+from datagen.train.baselines.rules import Analytic, DistanceBand, Proximity, Threshold, ThresholdVisibility
 from datagen.train.baselines.scalars import Scalars
 from datagen.train.inputs import Array, Batch
 from datagen.workers.robots import ROBOTS
 
-# By the name on the command line. `threshold-detector` uses estimated visibility without --detector.
+# By the name on the command line.
 BASELINES: dict[str, Callable[[], Baseline]] = {
     "proximity": Proximity,
     "threshold": Threshold,
-    "threshold-detector": ThresholdDetector,
+    "threshold-visibility": ThresholdVisibility,
     "distance": DistanceBand,
     "analytic": Analytic,
     "reachability": Reachability,
@@ -29,23 +27,20 @@ BASELINES: dict[str, Callable[[], Baseline]] = {
 
 def make_baselines(
     names: Sequence[str],
-    detector: str | Path | None = None,
     heuristic: HeuristicParams | None = None,
     seed: int = 0,
     robots: Sequence[str] = tuple(ROBOTS),
 ) -> list[Baseline]:
     """Return unfitted baselines. InputError for other names.
 
-    `detector` is a folder, `seed` is for `scalars`, and `robots` names those that `reachability` supports.
+    `seed` is for `scalars`, and `robots` names those that `reachability` supports.
     """
     for name in names:
         if name not in BASELINES:
             raise InputError("--baselines", name, "is not a baseline", choices(BASELINES, name))
     made: list[Baseline] = []
     for name in names:
-        if name == "threshold-detector" and detector is not None:
-            made.append(ThresholdDetector(ZeroShotDetector(detector), threshold=0.1))
-        elif name == "analytic" and heuristic is not None:
+        if name == "analytic" and heuristic is not None:
             made.append(Analytic(heuristic))
         elif name == "scalars":
             made.append(Scalars(seed))

@@ -16,7 +16,7 @@ from datagen.train.observed_visibility import observed_visibility
 from datagen.train.scorers import Scorer, scored
 
 # Further columns of a batch that baselines need.
-FIELDS = ("base_is_clear", "house_id", "object_name")
+FIELDS = ("base_is_clear", "house_id")
 # Penalty of impossible candidates, larger than any distance or probability.
 RULED_OUT = 100.0
 

@@ -1,4 +1,4 @@
-"""Baselines that are rules with given numbers: proximity, threshold (both of the paper), and analytic."""
+"""Baselines that are rules: proximity, threshold (both of the paper), by visibility, analytic, distance."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from datagen.schemas.specification import HeuristicParams
 from datagen.train.baselines.baseline import (
     RULED_OUT,
     Unfitted,
+    best_cut,
     is_feasible,
     labels,
     mount_m,
@@ -20,6 +21,7 @@ from datagen.train.baselines.baseline import (
     reach_m,
 )
 from datagen.train.inputs import F64, Array, Batch, Bools, is_clear
+from datagen.train.scorers import scored
 from datagen.workers.labels.distance_visibility_score import heuristic
 
 
@@ -43,6 +45,34 @@ class Threshold(Unfitted):
     def score(self, batch: Batch[Array]) -> F64:
         """1 or 0 (N,)."""
         return is_feasible(batch).astype(float)
+
+
+@dataclass(frozen=True)
+class ThresholdVisibility:
+    """Score: the estimated rho where the base is clear and the target within reach, else -1.
+
+    Positive from `threshold` on, which `fit` sets for the best balanced accuracy of feasible candidates.
+    """
+
+    threshold: float = 0.5
+    needs_fit = False
+    name = "threshold-visibility"
+
+    def score(self, batch: Batch[Array]) -> F64:
+        """Estimated rho (N,), and -1 for candidates that are not feasible."""
+        return np.where(is_feasible(batch), observed_rho(batch), -1.0)
+
+    def fit(self, batches: Sequence[Batch[Array]]) -> ThresholdVisibility:
+        """A copy with the best cut; unchanged where all feasible candidates have the same label."""
+        label = labels(batches, self.name)
+        score = np.concatenate([scored(self, b) for b in batches])
+        feasible = score >= 0
+        if label[feasible].all() or not label[feasible].any():
+            return self
+        return replace(self, threshold=best_cut(score[feasible], label[feasible]))
+
+    def state(self) -> dict[str, Any]:
+        return {"threshold": self.threshold}
 
 
 _PAPER = HeuristicParams()

@@ -1,4 +1,4 @@
-"""RGB-D frames of a scene. RENDERERS is the registry; each engine lives in one file."""
+"""RGB-D frames of a scene. RENDERERS is the registry."""
 
 from __future__ import annotations
 
@@ -74,11 +74,7 @@ def pixel_directions(camera: Camera, pixels: npt.NDArray[np.int64]) -> F32:
 Renderer = Callable[[SceneGeometry, Camera], Frame]
 
 
-RENDERERS: dict[str, str] = {
-    "embree": "datagen.workers.rendering.embree:render_embree",
-    "pybullet": "datagen.workers.rendering.pybullet_renderer:render_pybullet",
-    "sapien": "datagen.workers.rendering.sapien_renderer:render_sapien",
-}
+RENDERERS = {"embree": "datagen.workers.rendering.embree:render_embree"}
 
 
 def load_renderer(name: str) -> Renderer:

@@ -27,7 +27,7 @@ class Cloud:
 
 
 def caster_of(frame: Frame) -> PixelCaster:
-    """A caster that looks pixels up in a finished frame, for renderers of whole frames."""
+    """A caster that looks pixels up in a finished frame."""
     rgb, depth_m, body = frame.rgb.reshape(-1, 3), frame.depth_m.ravel(), frame.body.ravel()
     return lambda pixels: Pixels(rgb[pixels], depth_m[pixels], body[pixels])
 

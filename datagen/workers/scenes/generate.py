@@ -185,12 +185,10 @@ def _observe(
     rng: np.random.Generator,
     noise_rng: np.random.Generator,
 ) -> Cloud:
-    # Embree casts only the pixels that the cloud samples. Noise needs neighbouring pixels, and the
-    # other renderers make whole frames.
-    single = params.renderer == "embree" and not params.noise.enabled
+    # Without noise, which needs neighbouring pixels, only the pixels that the cloud samples are cast.
     cast: PixelCaster = (
         (lambda pixels: cast_pixels(rays, camera, pixels))
-        if single
+        if not params.noise.enabled
         else caster_of(render_frame(params, geometry, camera, noise_rng))
     )
     radius_m = float(rays.radii_m[0])

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from datagen.evaluation.columns import Columns
-from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.stored_arrays import facing_rad
 
 
@@ -32,17 +31,14 @@ def make_columns(
         robot=scene.copy(),
         label=label,
         is_clear=is_clear,
-        outcome=np.where(label, 0, rng.integers(1, len(OUTCOMES), n)).astype(np.uint8),
         base_xy_m=base_xy_m,
         base_yaw_rad=facing_rad(-base_xy_m).astype(np.float32),
         distance_m=(mount_m * 0.9).astype(np.float32),
         mount_distance_m=mount_m,
         reach_m=reach_m,
-        visibility=rng.random(n).astype(np.float32),
         scores=dict(scores) if scores is not None else {"random": rng.random(n)},
         house=np.array([f"house-{k % 5}" for k in range(n_scenes)], object),
         target=np.array([f"object-{k % 3}" for k in range(n_scenes)], object),
-        target_digest=np.array([f"{k % 3}" * 64 for k in range(n_scenes)], object),
         run=np.zeros(n_scenes, np.int64),
         is_grid=np.ones(n_scenes, np.bool_),
     )

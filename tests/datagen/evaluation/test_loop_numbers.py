@@ -10,7 +10,6 @@ import pytest
 from datagen.evaluation.closed_loop import (
     candidates_of,
     draw_offsets,
-    label_success,
     loop_table,
     pick_cells,
 )
@@ -77,35 +76,18 @@ def test_arrivals_of_all_errors_lie_in_like_directions_and_spread() -> None:
     assert len(set(angle[:, 0].tolist())) > 1  # scenes begin elsewhere
 
 
-def test_labels_around_an_arrival_are_those_of_the_cell_that_lies_there() -> None:
-    rng = np.random.default_rng(3)
-    label = (rng.random((SIDE, SIDE)) < 0.5).astype(float)
+def test_a_drift_ahead_follows_the_heading_of_the_base() -> None:
+    label = (np.random.default_rng(3).random((SIDE, SIDE)) < 0.5).astype(float)
     columns = make_grids(label, label)
-    maps = maps_of(columns)
-    # On the axis through the target a goal at x = -0.5 looks along +x: ahead is the next column.
-    goal = np.full((1, SCENES), 6 * SIDE + 3)
-    for (ahead, left), (row, column) in {
-        (0, 0): (6, 3),
-        (1, 0): (6, 4),
-        (0, 1): (7, 3),
-        (-2, -1): (5, 1),
-    }.items():
-        offsets = np.tile([ahead * STEP_M, left * STEP_M, 0.3], (1, SCENES, 1, 1))
-        nearest, bilinear = label_success(columns, maps, goal, offsets)
-        assert nearest.shape == (1, SCENES, 1)
-        assert (nearest == label[row, column]).all()
-        np.testing.assert_allclose(bilinear, label[row, column], atol=1e-5)
-    # With its right side to the target a base looks along +y there: ahead is the next row.
+    # On the axis through the target a goal at x = -0.5 looks along +x: ahead is the next column. With its
+    # right side to the target a base looks along +y there: ahead is the next row.
     right = replace(columns, base_yaw_rad=(columns.base_yaw_rad + np.pi / 2).astype(np.float32))
     np.testing.assert_allclose(np.cos(maps_of(right).yaw_rad - np.pi / 2), 1.0)
-    assert not maps.yaw_rad.any()
-    ahead = np.tile([STEP_M, 0.0, 0.0], (1, SCENES, 1, 1))
-    assert (label_success(right, maps_of(right), goal, ahead)[0] == label[7, 3]).all()
+    assert not maps_of(columns).yaw_rad.any()
     drift = Arrival("ahead", np.array([[STEP_M, 0.0, 0.0]]), False)
-    expected = smoothed(maps.truth, maps_of(right), drift)[:, 6, 3]
-    np.testing.assert_allclose(expected, label[7, 3], atol=1e-6)
-    far = np.tile([-1.0, 0.0, 0.0], (1, SCENES, 1, 1))
-    assert not np.any(label_success(columns, maps, goal, far))
+    for grids, cell in ((columns, (6, 4)), (right, (7, 3))):
+        maps = maps_of(grids)
+        np.testing.assert_allclose(smoothed(maps.truth, maps, drift)[:, 6, 3], label[cell], atol=1e-5)
 
 
 def test_rates_are_means_over_scenes_with_their_causes_and_gains() -> None:
@@ -117,19 +99,17 @@ def test_rates_are_means_over_scenes_with_their_causes_and_gains() -> None:
     smoothed = np.array([[good, good, good, bad]], object)
     outcomes = {("model", "nominal"): nominal, ("model", "smoothed"): smoothed,
                 ("plain", "nominal"): nominal, ("plain", "smoothed"): nominal}  # fmt: skip
-    said = dict.fromkeys(outcomes, np.full((1, SCENES, 2), 0.25))
     methods = [Method("model", 0.5, TrainedBy("two-stage", "shared")), Method("plain", 0.5)]
     weights = weights_for(columns, 200, 0)
     every = np.ones(SCENES, bool)
-    (row,) = loop_table(outcomes, said, ARRIVALS[:1], methods, weights, every)
+    (row,) = loop_table(outcomes, ARRIVALS[:1], methods, weights, every)
     assert row["methods"]["model"]["nominal"]["value"] == pytest.approx(0.5)
     assert row["methods"]["model"]["smoothed"]["value"] == pytest.approx(0.875)
     assert row["methods"]["model"]["nominal"]["failures"] == {"no_ik": 0.375, "no_lift": 0.125}
-    assert row["methods"]["model"]["nominal"]["by_labels"] == 0.25
     assert row["gains"]["model"]["value"] == pytest.approx(0.375) and row["gains"]["plain"]["high"] == 0
     (best,) = row["comparisons"]
     assert (best["first"], best["second"]) == ("model", "plain") and best["value"] == pytest.approx(0.375)
     assert row["methods"]["model"]["smoothed"]["low"] < 0.875
-    (half,) = loop_table(outcomes, said, ARRIVALS[:1], methods, weights, np.arange(SCENES) < 2)
+    (half,) = loop_table(outcomes, ARRIVALS[:1], methods, weights, np.arange(SCENES) < 2)
     assert half["methods"]["model"]["nominal"]["value"] == pytest.approx(0.5)
     assert half["methods"]["model"]["smoothed"]["value"] == 1

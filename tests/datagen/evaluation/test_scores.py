@@ -38,7 +38,7 @@ def scored(seed: int = 0, **changes: Any) -> Columns:
 
 def test_numbers_of_a_set_equal_counts_by_hand() -> None:
     columns = scored(n_scenes=40)
-    told = evaluate_set(columns, METHODS, "clear", weights_for(columns, 200, 0), ["0" * 64])
+    told = evaluate_set(columns, METHODS, "clear", weights_for(columns, 200, 0))
     rows = columns.is_clear
     label, said = columns.label[rows], columns.scores["noisy"][rows] >= 0.5
     assert (told["count"], told["positives"], told["scenes"]) == (rows.sum(), label.sum(), 40)
@@ -73,29 +73,10 @@ def test_a_method_without_threshold_labels_only_its_pick_positive() -> None:
     assert told["methods"]["nearest"]["accuracy"]["value"] == pytest.approx(right / len(cut))
 
 
-def test_breakdowns_group_all_candidates_and_mark_trained_objects() -> None:
-    columns = scored(n_scenes=30)
-    told = evaluate_set(columns, METHODS, "clear", weights_for(columns, 10, 0), ["0" * 64])
-    headings = dict.fromkeys(row["by"] for row in told["breakdown"])
-    assert list(headings) == [
-        *("object", "distance (m)", "mount distance / reach", "visibility", "outcome", "object trained on"),
-    ]
-    for heading in headings:
-        rows = [row for row in told["breakdown"] if row["by"] == heading]
-        assert sum(row["count"] for row in rows) == told["count"]
-        assert sum(row["positives"] for row in rows) == told["positives"]
-        weighted = sum(row["count"] * row["methods"]["noisy"]["accuracy"] for row in rows)
-        assert weighted / told["count"] == pytest.approx(told["methods"]["noisy"]["accuracy"]["value"])
-    trained = [row["count"] for row in told["breakdown"] if row["by"] == "object trained on"]
-    on_first = columns.is_clear & (columns.scene % 3 == 0)
-    assert trained == [on_first.sum(), told["count"] - on_first.sum()]
-
-
 def test_only_probabilities_have_a_calibration() -> None:
     columns = scored()
     methods = evaluate_set(columns, METHODS, "clear", weights_for(columns, 10, 0))["methods"]
     assert methods["noisy"]["brier"] > 0 and methods["noisy"]["expected_calibration_error"] > 0
-    assert sum(b["count"] for b in methods["noisy"]["reliability"]) == columns.is_clear.sum()
     # A number in [0, 1] is a probability only where the method says so.
     assert [methods[name]["brier"] for name in ("truth", "constant", "nearest")] == [None, None, None]
 

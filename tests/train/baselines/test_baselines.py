@@ -23,8 +23,7 @@ from datagen.train.baselines.baseline import (
     observed_rho,
     planar_distance_m,
 )
-from datagen.train.baselines.detector import ThresholdDetector
-from datagen.train.baselines.rules import Analytic, DistanceBand, Proximity
+from datagen.train.baselines.rules import Analytic, DistanceBand, Proximity, ThresholdVisibility
 from datagen.train.baselines.scalars import FAR_M, FEATURES, Scalars, features, observed_clearance_m
 from datagen.train.dataset import SampleStream
 from datagen.train.inputs import F64, Batch, is_clear
@@ -153,18 +152,18 @@ def test_scalars_leave_out_whole_houses_and_stop_before_they_learn_noise_by_hear
         Scalars().fit(batches[:1])
 
 
-def test_the_stand_in_is_named_so_and_fits_among_feasible_candidates() -> None:
+def test_the_cut_of_visibility_is_fitted_among_feasible_candidates() -> None:
     batches = [make_batch(seed) for seed in range(2)]
-    stand_in = ThresholdDetector().fit(batches)
-    assert "stand-in" in stand_in.name and stand_in.threshold >= 0
+    by_rho = ThresholdVisibility().fit(batches)
+    assert by_rho.threshold >= 0
     expected = np.where(is_feasible(batches[0]), observed_rho(batches[0]), -1)
-    assert np.array_equal(stand_in.score(batches[0]), expected)
+    assert np.array_equal(by_rho.score(batches[0]), expected)
 
 
 def test_impossible_fits_and_scores_give_one_line() -> None:
     batch = make_batch(0)
     one_class = replace(batch, label=np.zeros_like(batch.label))
-    for name in ("distance", "scalars", "threshold-detector"):
+    for name in ("distance", "scalars", "threshold-visibility"):
         with pytest.raises(InputError, match="labels are equal"):
             BASELINES[name]().fit([one_class])
     with pytest.raises(InputError, match="labels are equal"):

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from datagen.workers.geometry.mesh import F64, I32
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.rendering import Camera, SceneGeometry
-from datagen.workers.rendering.pybullet_renderer import Drawing
+from tests.workers.rendering.pybullet_renderer import Drawing
 
 _NEAR_M = 0.001  # shows the wall that an eye stands in
 

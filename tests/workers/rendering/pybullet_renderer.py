@@ -1,4 +1,4 @@
-"""RGB-D frames by pybullet's TinyRenderer: a software rasteriser, no render device."""
+"""RGB-D frames by pybullet's TinyRenderer, a software rasteriser, to hold those by Embree against."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy.typing as npt
 import pybullet  # pyright: ignore[reportMissingImports]  # no wheels from Python 3.12 on
 from PIL import Image
 
-from datagen.schemas.errors import InputError
-from datagen.workers.geometry.mesh import F32, F64, U8, Mesh, concatenate, face_normals, face_texture
+from datagen.workers.geometry.mesh import F32, F64, U8, Mesh, concatenate, face_normals
 from datagen.workers.geometry.transforms import inverse, quaternion_wxyz
 from datagen.workers.rendering import Camera, Frame, SceneGeometry
 
@@ -24,7 +23,7 @@ _AMBIENT, _DIFFUSE = 0.7, 0.3
 
 
 def render_pybullet(scene: SceneGeometry, camera: Camera) -> Frame:
-    """The whole frame of a scene, built from scratch. Raises InputError if Bullet opens no world."""
+    """The whole frame of a scene, built from scratch."""
     with Drawing() as drawing:
         drawing.add_scene(scene)
         return drawing.render(camera)
@@ -38,9 +37,7 @@ class Drawing:
 
     def __init__(self) -> None:
         self._world: int = pybullet.connect(pybullet.DIRECT)
-        if self._world < 0:
-            fix = "Render fewer scenes at once in one process, or use another renderer"
-            raise InputError("observation.renderer", "pybullet", "Bullet cannot open another world", fix)
+        assert self._world >= 0, "Bullet cannot open another world"
         self._label_of_body: list[int] = []
 
     def __enter__(self) -> Drawing:
@@ -144,3 +141,23 @@ def _projection_matrix(camera: Camera, near_m: float) -> list[float]:
     P[3, 2] = -1.0
     columns: list[float] = P.T.ravel().tolist()
     return columns
+
+
+_PALETTE_WIDTH = 256
+
+
+def face_texture(mesh: Mesh) -> tuple[F32, U8]:
+    """Texture coordinates (F, 3, 2) of the faces' corners and their image (H, W, 3).
+
+    A textured mesh gives its own. Flat face colours become texels of a palette, with all three
+    corners of a face in the middle of the same one. The origin is the image's lower left corner.
+    """
+    if mesh.texture is not None:
+        return mesh.texture.uv[mesh.faces], mesh.texture.image
+    colours, index = np.unique(mesh.face_rgb, axis=0, return_inverse=True)
+    height = max(1, -(-len(colours) // _PALETTE_WIDTH))
+    image = np.zeros((height * _PALETTE_WIDTH, 3), np.uint8)
+    image[: len(colours)] = colours
+    row, column = np.divmod(index.ravel(), _PALETTE_WIDTH)
+    uv = np.stack([(column + 0.5) / _PALETTE_WIDTH, 1 - (row + 0.5) / height], axis=1).astype(np.float32)
+    return np.repeat(uv[:, None], 3, axis=1), image.reshape(height, _PALETTE_WIDTH, 3)
