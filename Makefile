@@ -47,7 +47,7 @@ demo: venv-labels
 	$(BIN)/datagen show $(DEMO)/run --scene 9 --out $(DEMO)/scene.png
 	@echo
 	@echo "The picture: $(DEMO)/scene.png"
-	@echo "Next, the cost of these labels and of 180,000: $(BIN)/datagen audit $(DEMO)/run"
+	@echo "Next, the cost of these labels: $(BIN)/datagen audit $(DEMO)/run"
 
 # All three go on where they were stopped.
 paper-small: venv

@@ -55,7 +55,7 @@ _HEADINGS: dict[str, dict[str, tuple[str, str]]] = {
     "Look at runs": {
         "status": ("datagen.commands.status:status", "Show progress, failures and events of a run."),
         "show": ("datagen.commands.show:show", "Draw a picture of one scene of a run."),
-        "audit": ("datagen.commands.audit:audit", "Show the cost of labels by stage, and of 180,000."),
+        "audit": ("datagen.commands.audit:audit", "Show the cost of labels by stage."),
         "report": ("datagen.commands.report:report", "Write one HTML page about runs and models."),
     },
     "Check runs": {
