@@ -135,12 +135,13 @@ def _true_inputs(
         scene = reconstruct_scene(world, stored.record)
         candidates = reconstruct_candidates(stored.samples, scene)
         around = arm_in_scene(scene, candidates, 0, run.manifest.spec, StageClock()).planning.around
-        kept = around.kept[:poses]
-        T = around.T_world_tcp[kept]
+        free = np.flatnonzero(around.arrays.is_free > 0)
+        kept = free[:poses]
+        T = around.arrays.T_world_tcp[kept]
         axes = np.stack([T[:, :3, 3] - scene.target_center_m, T[:, :3, 2], T[:, :3, 1]], axis=1)
         grasps[row, : len(kept), 0] = 1
-        grasps[row, : len(kept), _OPENING] = 10 * around.opening_m[kept]
-        grasps[row, :, 1] = np.log1p(len(around.kept))
+        grasps[row, : len(kept), _OPENING] = 10 * around.opening_m[around.arrays.opening[kept]]
+        grasps[row, :, 1] = np.log1p(len(free))
         grasps[row, : len(kept), N_MEASURES:] = axes.reshape(len(kept), 9)
         # In the order of batches: by robot, then as stored.
         order = np.argsort(stored.samples["robot_index"], kind="stable")

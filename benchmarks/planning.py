@@ -141,7 +141,7 @@ def _outcome(
     if prepared.grasps_free == 0:
         return "no_grasp", None
     shoulder_m = T_world_base[:3, :3] @ robot.shoulder_m + T_world_base[:3, 3]
-    if np.linalg.norm(prepared.around.T_world_tcp[:, :3, 3] - shoulder_m, axis=1).min() > robot.reach_m:
+    if np.linalg.norm(prepared.around.arrays.T_world_tcp[:, :, 3] - shoulder_m, axis=1).min() > robot.reach_m:
         return "out_of_reach", None
     rng = generator(seed, Stream.PATH, scene.index, scene.retry, row)
     report = plan_candidate(prepared, T_world_base, rng)

@@ -40,8 +40,8 @@ def main() -> None:
         again = relabelled_specification(source, {"heuristic.mu": 0.6})
         done = relabel_run(open_storage(Path(folder) / "again"), source, again)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        assert done.end == "complete"
-        _print(done.runs[0], options.samples, wall, cpu)
+        assert done.summary.remaining == 0
+        _print(done.run, options.samples, wall, cpu)
 
 
 def _print(run: Run, samples: int, wall_s: float, cpu_s: float) -> None:

@@ -76,7 +76,7 @@ new_scratch = struct(Scratch)
 
 @compiled
 def scratch_of(moving: int, still: int) -> Scratch:
-    """Arrays for the checks of so many moving and still parts."""
+    """Arrays for checks of numbers of moving and of still parts."""
     return new_scratch(
         np.empty((4, 3)),
         np.empty(3),

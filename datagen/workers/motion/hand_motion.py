@@ -87,7 +87,7 @@ new_hand_work = struct(HandWork)
 
 @compiled
 def hand_workspace(parts: int, still: int) -> HandWork:
-    """Arrays for checks of a hand of so many parts in a room of so many still ones."""
+    """Arrays for checks of a hand, by the number of its parts and of still parts."""
     return new_hand_work(np.empty((1, 3, 4)), scratch_of(parts, still), scratch_of(parts, still))
 
 

@@ -57,7 +57,7 @@ new_reach_work = struct(ReachWork)
 
 @compiled
 def reach_workspace(coordinates: int) -> ReachWork:
-    """Arrays for so many coordinates."""
+    """Arrays for a number of coordinates."""
     return new_reach_work(
         np.empty((3, 4)),
         np.empty(7, np.int64),
