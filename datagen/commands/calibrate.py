@@ -65,7 +65,7 @@ def calibrate(
     if out.exists() or out.is_symlink():
         raise InputError(out, "--out", "already exists", "Choose another name, or remove it first")
     specs = _specifications(runs, candidates)
-    trials = _read(runs, candidates, allow_incomplete)
+    trials = _read(runs, candidates, allow_incomplete, all(s.candidates.in_range_by for s in specs))
     refuse_too_little(trials, ", ".join(runs))
     forms: tuple[Form, ...] = FORMS if distance == "any" else (distance,)
     before = specs[0].heuristic
@@ -161,8 +161,8 @@ def _specifications(paths: Sequence[str], candidates: Sets) -> list[Specificatio
     return [spec for _, spec in found]
 
 
-def _read(paths: Sequence[str], candidates: Sets, allow_incomplete: bool) -> Trials:
-    """The labels of all runs over the chosen set of candidates."""
+def _read(paths: Sequence[str], candidates: Sets, allow_incomplete: bool, all_reached: bool) -> Trials:
+    """The labels of all runs over the chosen set of candidates; `all_reached`: all are within reach."""
     reader = SampleReader(paths, ("house_id",), (*_INPUTS, "base_is_clear", "label"), allow_incomplete)
     parts: list[dict[str, Any]] = []
     n_scenes = 0
@@ -178,7 +178,8 @@ def _read(paths: Sequence[str], candidates: Sets, allow_incomplete: bool) -> Tri
         label=joined["label"] == 1,
     )
     is_clear = joined["base_is_clear"].astype(np.bool_)
-    return trials.at(in_set(candidates, is_clear, trials.mount_distance_m, trials.arm_reach_m))
+    is_reachable = (trials.mount_distance_m <= trials.arm_reach_m) | all_reached
+    return trials.at(in_set(candidates, is_clear, is_reachable))
 
 
 def _agreements(trials: Trials, labels: dict[str, Any]) -> dict[str, Any]:

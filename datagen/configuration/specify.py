@@ -95,6 +95,8 @@ def specify(
             candidates.setdefault("scaled_base", True)
         if label_source in ARM_PACKAGES and "within" not in candidates:
             candidates.setdefault("per_scene", "grid")
+        if label_source in ARM_PACKAGES and candidates.get("within") == "in-range" and _needs_set(chosen):
+            candidates.setdefault("in_range_by", "reachable-set")
         if candidates.get("per_scene") == "grid":
             # The cells of a whole grid are ranked against each other, so they have one robot.
             candidates.setdefault("robots_per_scene", 1)
@@ -107,6 +109,8 @@ def specify(
     if spec.candidates.per_scene == "grid" and spec.candidates.within is not None:
         problem = f"a whole grid has cells that are not {spec.candidates.within}"
         raise InputError(place, "candidates.within", problem, "Give --candidates-per-scene 60")
+    if spec.candidates.in_range_by is not None:
+        _prepare_set(spec, place)
     footprint_m = spec.candidates.footprint_m
     if footprint_m is not None and crosses_itself(np.array(footprint_m)):
         raise InputError(place, "candidates.footprint_m", "crosses itself", "Give its corners in order")
@@ -121,6 +125,23 @@ def specify(
     load_settler(spec.settle.engine)
     load_renderer(spec.observation.renderer)
     return spec.model_copy(update={"engines": scene_engines(spec) | label_engines(spec.label_source)})
+
+
+def _needs_set(robot: str | None) -> bool:
+    # Opens the robot, for which labels without an arm lack libraries.
+    from datagen.workers.motion.reachable_sampling import needs_set
+
+    return robot is not None and needs_set(robot)
+
+
+def _prepare_set(spec: Specification, place: str) -> None:
+    """Compute the robot's reachable set, which workers then find in the cache. InputError without a robot."""
+    if spec.arm is None:
+        problem, fix = f"{spec.label_source} has no arm", "Remove it, or submit plan or sim"
+        raise InputError(place, "candidates.in_range_by", problem, fix)
+    from datagen.workers.motion.reachable_sampling import reachable_set_of
+
+    reachable_set_of(spec.arm.robot_key)
 
 
 def read_fields(config: Path | None) -> dict[str, Any]:

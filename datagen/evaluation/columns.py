@@ -39,6 +39,8 @@ class Columns:
     target: Array  # (S,) text
     run: I64  # (S,) index of the run
     is_grid: Bools  # (S,) whether it has all cells of a grid, for one robot
+    # Runs whose candidates were all sampled from a reachable set.
+    reached_runs: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return len(self.label)
@@ -50,8 +52,8 @@ class Columns:
 
     @property
     def is_reachable(self) -> Bools:
-        """Whether (N,) the target is within the arm's reach from its mount: R_in of the paper."""
-        return self.mount_distance_m <= self.reach_m
+        """Whether (N,) the target is within the arm's reach from its mount, or its set: R_in of the paper."""
+        return (self.mount_distance_m <= self.reach_m) | np.isin(self.run, self.reached_runs)[self.scene]
 
     def at(self, rows: Bools) -> Columns:
         """Some of the candidates (N,); the scenes and their numbers stay."""
@@ -63,16 +65,18 @@ class Columns:
         return replace(cut, scene=(np.cumsum(kept) - 1)[cut.scene])
 
     def _cut(self, rows: Bools, scenes: Bools) -> Columns:
-        cut = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "scores"}
+        cut = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _OF_ALL}
         cut = {name: values[scenes if name in _SCENE_COLUMNS else rows] for name, values in cut.items()}
-        return Columns(**cut, scores={name: score[rows] for name, score in self.scores.items()})
+        scores = {name: score[rows] for name, score in self.scores.items()}
+        return Columns(**cut, scores=scores, reached_runs=self.reached_runs)
 
     def is_in(self, candidates: str) -> Bools:
         """Mask (N,) of the candidates in a set of `CANDIDATE_SETS`."""
-        return in_set(candidates, self.is_clear, self.mount_distance_m, self.reach_m)
+        return in_set(candidates, self.is_clear, self.is_reachable)
 
 
 _SCENE_COLUMNS = ("house", "target", "run", "is_grid")
+_OF_ALL = ("scores", "reached_runs")
 
 
 def gather(
@@ -103,7 +107,7 @@ def gather(
             seen(len(batch.clouds))
     joined = {name: np.concatenate([p.pop(name) for p in parts]) for name in list(parts[0])}
     scores = {name: joined.pop(f"score {name}") for name in scorers}
-    return Columns(**joined, scores=scores), seconds
+    return Columns(**joined, scores=scores, reached_runs=()), seconds
 
 
 def _rows(batch: Batch[Array], first_scene: int, first_robot: int) -> dict[str, Array]:

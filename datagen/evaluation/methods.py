@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -286,6 +286,8 @@ def score_runs(
 
         batches = [(run.cells, run.stream.epoch(0)) for run in runs]
         columns, seconds = gather(batches, {m.name: m.scorer for m in methods}, step)
+    reached = (k for k, run in enumerate(runs) if all(s.candidates.in_range_by for s in run.specs))
+    columns = replace(columns, reached_runs=tuple(reached))
     return columns, {name: 600 * spent_s / len(columns) for name, spent_s in seconds.items()}
 
 

@@ -12,6 +12,7 @@ from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.shard_reading import read_committed
+from datagen.workers.bases.candidate_sets import within_reach
 
 Array = npt.NDArray[Any]
 Bools = npt.NDArray[np.bool_]
@@ -81,7 +82,9 @@ def read_columns(run: Run) -> RunColumns | None:
         scenes=joined["scene_index"].astype(np.int64),
         label=joined["label"] == 1,
         is_clear=joined["base_is_clear"] == 1,
-        is_within_reach=joined["mount_distance_m"] <= joined["arm_reach_m"],
+        is_within_reach=within_reach(
+            run.manifest.spec.candidates, joined["mount_distance_m"], joined["arm_reach_m"]
+        ),
         distance_m=joined["distance_m"].astype(np.float64),
         offset_m=turned(joined, scene),
         outcome=joined.get("outcome"),

@@ -15,7 +15,7 @@ from datagen.schemas.run import MOST_SAMPLES, Run
 from datagen.schemas.shard_reading import read_committed
 from datagen.schemas.specification import Specification
 from datagen.train.bootstrap import Estimate
-from datagen.workers.bases.candidate_sets import Bools, in_set
+from datagen.workers.bases.candidate_sets import Bools, in_set, within_reach
 
 # In ascending fidelity: the later of two is the reference for the earlier.
 _FIDELITY = ("heuristic", "plan", "sim")
@@ -58,13 +58,14 @@ def read_labels(run: Run) -> Labels:
     def joined(name: str) -> Any:
         return np.concatenate([np.zeros(0, np.uint8), *(shard[name] for shard in shards)])
 
-    clear, near = joined("base_is_clear") == 1, (joined("mount_distance_m"), joined("arm_reach_m"))
+    sizes_m = joined("mount_distance_m"), joined("arm_reach_m")
+    near = within_reach(run.manifest.spec.candidates, *sizes_m)
     return Labels(
         run=run,
         scene=joined("sample_scene_index").astype(np.int64),
         candidate=joined("candidate_index").astype(np.int64),
         label=joined("label") == 1,
-        within_reach=in_set("in-range", clear, *near),
+        within_reach=in_set("in-range", joined("base_is_clear") == 1, near),
         outcome=joined("outcome") if has_outcome else None,
     )
 

@@ -91,6 +91,9 @@ class CandidateParams(Frozen):
     jitter: bool = True
     # Only where the base is clear, or also within the arm's reach; None: all cells.
     within: Literal["clear", "in-range"] | None = None
+    # In-range where the reachable set of the arm's robot holds the target's centre; None: where it is within
+    # arm_reach_m of the mount.
+    in_range_by: Literal["reachable-set"] | None = None
     robots_per_scene: int = Field(default=4, ge=1, le=625)
     robot_per_candidate: bool = False
     camera_height_m: Range = Range(low=0.8, high=1.5)
@@ -108,6 +111,12 @@ class CandidateParams(Frozen):
     mast_radius_m: Metres = 0.05
     # Heading of the base, relative to the direction from it to the target; None: the base faces the target.
     yaw_rad: Turns | None = None
+
+    @model_validator(mode="after")
+    def _is_in_range(self) -> CandidateParams:
+        if self.in_range_by is not None and self.within != "in-range":
+            raise ValueError("in_range_by is for within = 'in-range'")
+        return self
 
     @model_validator(mode="after")
     def _holds_mount(self) -> CandidateParams:

@@ -10,14 +10,16 @@ import pytest
 import datagen.workers.robots
 from datagen import cli
 from datagen.replaying import open_sources
+from datagen.reports.agreement import read_labels
 from datagen.schemas.fields import OUTCOMES
-from datagen.schemas.run import Run
+from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.shard_reading import read_scene
 from datagen.workers.bases.clearance import Footprint, base_clearance_m
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.labels.arm_labelling import arm_in_scene
 from datagen.workers.labels.arrival_trial import try_arrival
+from datagen.workers.motion.reachable_sampling import reachable_set_of
 from datagen.workers.robots import ROBOTS, robot_limits
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
 from tests.refusals import refused
@@ -132,6 +134,43 @@ def test_a_robot_works_at_its_side(sideways: tuple[str, Path], tmp_path: Path) -
     assert cli.run(["show", str(run), "--scene", "0", *out]) == 0
     assert cli.run(["show", str(run), "--scene", "0", "--trial", "best", *out]) == 0
     assert cli.run(["verify", str(run), "--replay", "1"]) == 0
+
+
+@needs_sim
+def test_candidates_of_such_a_robot_are_drawn_where_its_hand_gets(
+    sideways: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot_file, run = sideways
+    arrays, (spec,) = arrays_of(run), [part.manifest.spec for part in open_runs(run)]
+    assert spec.candidates.in_range_by == "reachable-set"
+    found = reachable_set_of(robot_file)
+    T_world_object = arrays["T_world_object"][:, 0].astype(np.float64)
+    good = arrays["label"] == 1
+    for row, scene in enumerate(np.searchsorted(arrays["scene_index"], arrays["sample_scene_index"])):
+        (x, y), yaw = arrays["base_xy_m"][row].tolist(), float(arrays["base_yaw_rad"][row])
+        T_base_object = np.linalg.inv(yaw_pose(x, y, 0.6, yaw)) @ T_world_object[scene]
+        assert found.holds(T_base_object[None, :3, 3]).all()
+        if good[row]:
+            T_base_tcp = T_base_object @ arrays["T_target_tcp"][row]
+            assert found.holds(T_base_tcp[None, :3, 3]).all()
+    # All of them are in range for statistics, whatever a distance says.
+    (labels,) = map(read_labels, open_runs(run))
+    assert labels.within_reach.all()
+    # Another robot of its numbers faces the target: there a distance is right.
+    make_small_run(tmp_path / "plain", PER_SCENE, "--robot", "panda", "--candidates", "in-range")
+    (plain,) = open_runs(tmp_path / "plain")
+    assert plain.manifest.spec.candidates.in_range_by is None
+    line = ["submit", "plan", "--n", "4", "--out", str(tmp_path / "a"), *HERE, "--config"]
+    for robot, source, text, words in (
+        ("panda", "heuristic", 'within = "in-range"', ["candidates.in_range_by", "heuristic has no arm"]),
+        ("panda-scaled", "plan", 'within = "in-range"', ["candidates.in_range_by", "is scaled to reaches"]),
+        ("panda", "plan", 'within = "clear"', ["candidates", "in_range_by is for within = 'in-range'"]),
+        ("panda", "plan", 'within = "in-range"\nin_range_by = "ball"', ["candidates.in_range_by", "ball"]),
+    ):
+        key = "" if "ball" in text else 'in_range_by = "reachable-set"\n'
+        (tmp_path / "run.toml").write_text(f"[candidates]\nper_scene = 4\n{key}{text}\n")
+        line[1] = source
+        refused([*line, str(tmp_path / "run.toml"), "--robot", robot], capsys, *words)
 
 
 @needs_sim

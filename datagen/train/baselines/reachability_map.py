@@ -16,13 +16,12 @@ import numpy as np
 
 from datagen.train.inputs import F32, F64, Bools
 from datagen.workers.kinematics.tree import frame_poses
-from datagen.workers.robots import open_robot, robot_limits
+from datagen.workers.motion.reachable_set import AZIMUTHS, LEVELS, direction_parts, part_directions
+from datagen.workers.robots import gripper_of, open_robot, robot_limits
 from datagen.workers.robots.gripper import Gripper
 
 # Length of the hand's last way, a straight line; the default of `motion.pregrasp_m`.
 PREGRASP_M = 0.08
-# Parts of the sphere of approach directions, all of one area: by their z, and by their azimuth.
-LEVELS, AZIMUTHS = 8, 16
 _SAMPLES, _AT_ONCE = 1 << 18, 1 << 15
 _CELLS_PER_REACH = 16
 _SEED = 0x3EAC
@@ -35,20 +34,21 @@ class ReachabilityMap:
     """Whether the hand reaches a position from a pregrasp, by ring of positions and part of directions.
 
     Distances from the vertical through the mount begin at 0, heights at `lowest` below it; both are in cells
-    of 1 / `_CELLS_PER_REACH` of the reach. A direction's azimuth is 0 where it points away from the robot.
+    of a share of the reach. A direction's azimuth is 0 where it points away from the robot.
     """
 
     reachable: F32  # (D, H, LEVELS, AZIMUTHS), 0 to 1
     lowest: float  # in units of the reach
     gripper: Gripper
+    cells_per_reach: float = _CELLS_PER_REACH
 
     def at(self, distance: F64, height: F64) -> F32:
         """Reachability (N, LEVELS, AZIMUTHS) at distances and heights (N,), in units of the reach.
 
         Between the cells' centres it is bilinear, beyond the map 0.
         """
-        row = distance * _CELLS_PER_REACH - 0.5
-        column = (height - self.lowest) * _CELLS_PER_REACH - 0.5
+        row = distance * self.cells_per_reach - 0.5
+        column = (height - self.lowest) * self.cells_per_reach - 0.5
         found = np.zeros((len(row), LEVELS, AZIMUTHS), np.float32)
         rings, heights = self.reachable.shape[:2]
         for i in (np.floor(row), np.floor(row) + 1):
@@ -63,10 +63,27 @@ class ReachabilityMap:
 
 def reachability_map(robot: str, reach_m: float) -> ReachabilityMap:
     """The map of a robot of the registry with that reach (m). InputError where its files are missing."""
+    # Needs the compiler, as other parts of the arm do.
+    from datagen.workers.motion.reachable_sampling import needs_set
+
     low, high = robot_limits(robot).reach_m
+    if needs_set(robot):
+        return _of_set(robot)
     if low == high:
         return _map(robot, None)
     return _map(robot, float(np.clip(np.ceil(reach_m / _STEP_M - 0.01) * _STEP_M, low, high)))
+
+
+@lru_cache(maxsize=8)
+def _of_set(name: str) -> ReachabilityMap:
+    """That of a robot that is judged by its reachable set: where it has the target as it presents itself."""
+    from datagen.workers.motion.reachable_sampling import reachable_set_of
+
+    found, limits = reachable_set_of(name), robot_limits(name)
+    there = found.directions_at(-limits.yaw_rad)
+    reach_m = limits.reach_m[0]
+    poses = ReachabilityMap(there, found.lowest_m / reach_m, gripper_of(name), reach_m / found.cell_m)
+    return replace(poses, reachable=there * _backed(poses, PREGRASP_M / reach_m))
 
 
 @lru_cache(maxsize=32)
@@ -93,8 +110,8 @@ def _map(name: str, reach_m: float | None) -> ReachabilityMap:
 def _backed(poses: ReachabilityMap, back: float) -> F32:
     """Reachability (D, H, LEVELS, AZIMUTHS) of the pose that lies `back` behind each one of the map."""
     rings, heights = poses.reachable.shape[:2]
-    distance = np.repeat((np.arange(rings) + 0.5) / _CELLS_PER_REACH, heights)
-    height = np.tile((np.arange(heights) + 0.5) / _CELLS_PER_REACH + poses.lowest, rings)
+    distance = np.repeat((np.arange(rings) + 0.5) / poses.cells_per_reach, heights)
+    height = np.tile((np.arange(heights) + 0.5) / poses.cells_per_reach + poses.lowest, rings)
     found = np.empty((rings * heights, LEVELS, AZIMUTHS), np.float32)
     for (level, azimuth), (x, y, z) in _by_part(part_directions()):
         # The hand moves along a line: behind, its direction is the same, its azimuth from the mount is not.
@@ -108,24 +125,6 @@ def _backed(poses: ReachabilityMap, back: float) -> F32:
 def _by_part(directions: F64) -> Iterator[tuple[tuple[int, int], F64]]:
     for level, azimuth in np.ndindex(*directions.shape[:2]):
         yield (level, azimuth), directions[level, azimuth]
-
-
-def direction_parts(directions: F64, ahead_rad: F64 | float = 0.0) -> tuple[F64, F64]:
-    """Parts (N,) of unit vectors (N, 3), by level and azimuth, counted from the azimuth `ahead_rad`.
-
-    Whole numbers are the parts' lower edges.
-    """
-    azimuth = (np.arctan2(directions[:, 1], directions[:, 0]) - ahead_rad) / (2 * np.pi) % 1
-    return (directions[:, 2] + 1) / 2 * LEVELS, azimuth * AZIMUTHS
-
-
-def part_directions() -> F64:
-    """Unit vectors (LEVELS, AZIMUTHS, 3) in the middle of each part."""
-    z = (np.arange(LEVELS) + 0.5) / LEVELS * 2 - 1
-    azimuth = (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS * 2 * np.pi
-    flat = np.sqrt(1 - z**2)[:, None]
-    x, y = flat * np.cos(azimuth), flat * np.sin(azimuth)
-    return np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], axis=2)
 
 
 _ROLLS = 4  # in half a turn about the approach: the hand is the same after half a turn

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from datagen.schemas.specification import CandidateParams
+
 Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.floating[Any]]
 
@@ -15,11 +17,18 @@ Floats = npt.NDArray[np.floating[Any]]
 CANDIDATE_SETS = ("in-range", "clear", "grid")
 
 
-def in_set(name: str, is_clear: Bools, mount_distance_m: Floats, arm_reach_m: Floats) -> Bools:
+def within_reach(params: CandidateParams, mount_distance_m: Floats, arm_reach_m: Floats) -> Bools:
+    """Mask (N,) of a run's candidates within reach: all, where they were sampled from a reachable set."""
+    if params.in_range_by is not None:
+        return np.ones(len(mount_distance_m), np.bool_)
+    return mount_distance_m <= arm_reach_m
+
+
+def in_set(name: str, is_clear: Bools, is_reachable: Bools) -> Bools:
     """Mask (N,) of the candidates in a set of CANDIDATE_SETS: clear, clear and within reach, or all."""
     match name:
         case "in-range":
-            return is_clear & (mount_distance_m <= arm_reach_m)
+            return is_clear & is_reachable
         case "clear":
             return is_clear
         case _:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,19 @@ Bools = npt.NDArray[np.bool_]
 ROUNDS = 8
 # Robots sampled per robot that a scene needs, before the scene is rejected.
 DRAWS_A_ROBOT = 16
+
+
+class Reach(Protocol):
+    """Where a hand gets; `ReachableSet` is one."""
+
+    @property
+    def farthest_m(self) -> float:
+        """Horizontal distance from the mount beyond which no position is reached."""
+        ...
+
+    def holds(self, positions_base_m: F64) -> Bools:
+        """Whether the hand gets to positions (N, 3) in the base frame: the mount, x to the front."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +93,11 @@ def footprint_of(params: CandidateParams) -> Footprint | None:
 
 
 def draw_candidates(
-    target_center_m: F64, obstacles: Obstacles, params: CandidateParams, rng: np.random.Generator
+    target_center_m: F64,
+    obstacles: Obstacles,
+    params: CandidateParams,
+    rng: np.random.Generator,
+    reach: Reach | None = None,
 ) -> SceneCandidates | None:
     """Return all cells of the grid, or `per_scene` positions jittered within cells, with their robots.
 
@@ -92,6 +110,8 @@ def draw_candidates(
     target has room for it. There are `ROUNDS` rounds, each over all cells in random order with new jitter,
     and a robot uses the first cells in the set. The scene's robots share the rounds and use each cell of a
     round once. Returns None if too few of `DRAWS_A_ROBOT` times the needed robots are kept.
+
+    In-range is where `reach` holds the target's centre, or without it within the robot's reach of its mount.
     """
     n = params.count
     n_robots = n if params.robot_per_candidate else min(params.robots_per_scene, n)
@@ -102,7 +122,7 @@ def draw_candidates(
         yaw_rad = _headings(base_xy_m, target_center_m, params, rng)
         return _with_clearance(base_xy_m, yaw_rad, robot_index, robots, obstacles, params)
     drawn = _draw_robots(params, DRAWS_A_ROBOT * n_robots, rng)
-    rounds = _Rounds(target_center_m, obstacles, params, rng)
+    rounds = _Rounds(target_center_m, obstacles, params, rng, reach)
     rows = np.empty(n, np.int64)
     kept: list[int] = []
     for robot in range(len(drawn)):
@@ -198,9 +218,11 @@ class _Rounds:
         obstacles: Obstacles,
         params: CandidateParams,
         rng: np.random.Generator,
+        reach: Reach | None,
     ) -> None:
         cells = grid_offsets(params)
         self._target_m, self._obstacles, self._params = target_center_m, obstacles, params
+        self._reach = reach
         self._n_cells = len(cells)
         # The cells of all rounds, one round after the other.
         self._cell = np.concatenate([rng.permutation(len(cells)) for _ in range(ROUNDS)])
@@ -213,7 +235,8 @@ class _Rounds:
         self._apart_m = np.sqrt(2.0) * step_m if params.jitter else 0.0
         # Rows of the first round with a position in the cell that the longest arm reaches; all for "clear".
         first_m = self.xy_m[: len(cells)].astype(np.float64) - target_center_m[:2]
-        far_m = np.inf if params.within == "clear" else params.arm_reach_m.high + self._apart_m
+        far_m = params.arm_reach_m.high if reach is None else reach.farthest_m
+        far_m = np.inf if params.within == "clear" else far_m + self._apart_m
         self._first = np.flatnonzero(np.linalg.norm(first_m, axis=1) <= far_m)
         self._around = self._distances(self._first)
         # Only part of a cell may be indoors; a base at any heading holds the inner circle of its polygon.
@@ -223,18 +246,18 @@ class _Rounds:
         """Rows (n,) of poses for a robot, now marked as used; None if fewer are free and in the set."""
         rows = self._first
         radius_m = self._params.radius_of_base_m(robots.arm_reach_m[robot])
-        margin_m = self._margins_m(rows, self._around, robots, robot, radius_m)
+        margin_m = self._margins_m(rows, self._around, robots, robot, radius_m, exact=True)
         found = rows[(margin_m >= 0) & self._free[rows]]
         if len(found) < n:
             # Within a cell, clearance and distance differ by at most the distance between positions.
             is_possible = np.zeros(self._n_cells, np.bool_)
             least_m = radius_m if self._footprint is None else self._footprint.inner_m
-            anywhere_m = self._margins_m(rows, self._unbounded, robots, robot, least_m)
+            anywhere_m = self._margins_m(rows, self._unbounded, robots, robot, least_m, exact=False)
             is_possible[self._cell[rows[anywhere_m >= -self._apart_m]]] = True
             later = self._n_cells + np.flatnonzero(is_possible[self._cell[self._n_cells :]])
             if len(found) + len(later) < n:
                 return None
-            margin_m = self._margins_m(later, self._distances(later), robots, robot, radius_m)
+            margin_m = self._margins_m(later, self._distances(later), robots, robot, radius_m, exact=True)
             found = np.concatenate([found, later[(margin_m >= 0) & self._free[later]]])
         if len(found) < n:
             return None
@@ -263,12 +286,24 @@ class _Rounds:
         robots: _SceneRobots,
         robot: int,
         radius_m: F64 | np.float64,
+        exact: bool,
     ) -> F32:
-        """The smaller of clearance and remaining reach (N,); not negative for positions in the set."""
+        """The smaller of clearance and remaining reach (N,); not negative for positions in the set.
+
+        A reachable set has no distance to its border: if not `exact`, that to all of it is given.
+        """
         camera_m, mount_m, reach_m = (
             column[robot] for column in (robots.camera_height_m, robots.base_height_m, robots.arm_reach_m)
         )
         margin_m = around.clearance_m(mount_m, camera_m, radius_m, self._params.mast_radius_m)
         if self._params.within == "clear":
             return margin_m
-        return np.minimum(margin_m, reach_m - _distances(self.xy_m[rows], mount_m, self._target_m)[1])
+        if self._reach is None:
+            return np.minimum(margin_m, reach_m - _distances(self.xy_m[rows], mount_m, self._target_m)[1])
+        x, y = (self._target_m[:2] - self.xy_m[rows]).T
+        if not exact:
+            return np.minimum(margin_m, (self._reach.farthest_m - np.hypot(x, y)).astype(np.float32))
+        turn = self.yaw_rad[rows].astype(np.float64)
+        c, s, rise_m = np.cos(turn), np.sin(turn), np.full(len(rows), self._target_m[2] - float(mount_m))
+        is_held = self._reach.holds(np.column_stack([c * x + s * y, c * y - s * x, rise_m]))
+        return np.where(is_held, margin_m, np.float32(-np.inf))

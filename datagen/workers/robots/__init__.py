@@ -107,15 +107,16 @@ def open_robot(name: str, reach_m: float | None, base_height_m: float) -> Robot:
 
 def gripper_of(name: str) -> Gripper:
     """The gripper of a robot, which is the same at every reach and height."""
-    return _any_of(name).gripper
+    return open_largest(name).gripper
 
 
 def coordinates_of(name: str) -> int:
     """Number of coordinates that move a robot's arm."""
-    return len(_any_of(name).joint_names)
+    return len(open_largest(name).joint_names)
 
 
-def _any_of(name: str) -> Robot:
+def open_largest(name: str) -> Robot:
+    """A robot with its largest reach, on its lowest mount."""
     limits = robot_limits(name)
     height_m = limits.base_height_m[0] if limits.base_height_m else 0.0
     return open_robot(name, limits.reach_m[1], height_m)

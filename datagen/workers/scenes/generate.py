@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.run_records import StageClock
-from datagen.schemas.specification import CandidateParams, ObservationParams, SettleParams
+from datagen.schemas.specification import CandidateParams, ObservationParams, SettleParams, Specification
 from datagen.workers.bases.candidates import SceneCandidates, draw_candidates
 from datagen.workers.bases.clearance import Obstacles, base_clearance_m
 from datagen.workers.geometry.mesh import F64
@@ -33,6 +34,9 @@ from datagen.workers.scenes.placement import (
 )
 from datagen.workers.settling import SettleResult, load_settler
 from datagen.workers.world import PreparedHouse, World
+
+if TYPE_CHECKING:
+    from datagen.workers.motion.reachable_set import ReachableSet
 
 # Objects that roll off the support touch no static part farther from it than this.
 _SURROUNDINGS_M = 0.3
@@ -109,7 +113,7 @@ def _try_scene(
     target_m = settled.T_world_object[0, :3, 3]
     with clock.stage("draw"):
         rng = generator(spec.seed, Stream.CANDIDATES, index, retry)
-        candidates = draw_candidates(target_m, house.obstacles, spec.candidates, rng)
+        candidates = draw_candidates(target_m, house.obstacles, spec.candidates, rng, _reach_of(spec))
         if candidates is None:
             raise SceneRejected("no_base")
 
@@ -125,6 +129,19 @@ def _try_scene(
         cloud = _observe(spec.observation, geometry, rays, camera, rng, noise_rng)
     scene = Scene(index, retry, redraws, house, surface, models, settled, rays, camera, share, cloud)
     return scene, candidates
+
+
+def _reach_of(spec: Specification) -> ReachableSet | None:
+    """The reachable set by which candidates are in range. InputError where the specification has no robot."""
+    if spec.candidates.in_range_by is None:
+        return None
+    if spec.arm is None:
+        fix = "Submit plan or sim, which have an arm"
+        raise InputError("specification", "candidates.in_range_by", "has no robot", fix)
+    # Needs the compiler, which labels without an arm do not.
+    from datagen.workers.motion.reachable_sampling import reachable_set_of
+
+    return reachable_set_of(spec.arm.robot_key)
 
 
 def _load_house(world: World, house_id: str) -> PreparedHouse:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from datagen.workers.bases.candidates import (
     grid_offsets,
 )
 from datagen.workers.bases.clearance import Footprint, Obstacles, base_clearance_m, obstacles_of
+from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.houses.house import StaticBody
 from tests.workers.worlds import ROOM_M, TABLE_SIZE_M, TABLE_TOP_M, box_body, table_house
 
@@ -151,8 +152,24 @@ def cupboard(side: int, gap_m: float, depth_m: float = 0.4) -> StaticBody:
     return box_body(f"cupboard|{side}", "furniture", "Cabinet", (*size, 1.0), (*centre, 0.5))
 
 
+@dataclass(frozen=True)
+class OneSide:
+    """A hand that gets to a ring at the left of its base, below a height."""
+
+    farthest_m: float = 0.8
+
+    def holds(self, positions_base_m: np.ndarray) -> np.ndarray:
+        x, y, z = positions_base_m.T
+        distance_m = np.hypot(x, y)
+        return (y >= -0.1) & (distance_m <= self.farthest_m) & (distance_m > 0.3) & (z < 0.15)
+
+
 def plain_candidates(
-    target_m: np.ndarray, obstacles: Obstacles, params: CandidateParams, rng: np.random.Generator
+    target_m: np.ndarray,
+    obstacles: Obstacles,
+    params: CandidateParams,
+    rng: np.random.Generator,
+    hand: OneSide | None = None,
 ) -> SceneCandidates | None:
     """`draw_candidates` in its simplest form: every robot at every position of every round."""
     n, n_robots = params.count, min(params.robots_per_scene, params.count)
@@ -183,7 +200,9 @@ def plain_candidates(
         one = np.zeros(len(xy_m), np.int16)
         there = SceneCandidates(xy_m, yaw_rad, one, camera, mount, reach, clearance_m)
         inside = clearance_m >= 0
-        if params.within == "in-range":
+        if params.within == "in-range" and hand is not None:
+            inside &= hand.holds(seen_from(there, target_m))
+        elif params.within == "in-range":
             inside &= distances(there, target_m)[1] <= reach
         own = np.arange(n) % n_robots == len(robots)
         found = np.flatnonzero(inside & free)[: own.sum()]
@@ -201,6 +220,17 @@ def plain_candidates(
             )
             return SceneCandidates(xy_m[rows], yaw_rad[rows], index, *heights, reach_m[robot], clearance_m)
     return None
+
+
+def seen_from(bases: SceneCandidates, target_m: np.ndarray) -> np.ndarray:
+    """The target (N, 3) in the frames of the mounts."""
+    T = [
+        yaw_pose(*xy, height, yaw)
+        for xy, height, yaw in zip(
+            bases.base_xy_m.tolist(), bases.base_height_m.tolist(), bases.base_yaw_rad.tolist(), strict=True
+        )
+    ]
+    return (np.linalg.inv(np.stack(T)) @ np.append(target_m, 1.0))[:, :3]
 
 
 @given(
@@ -229,14 +259,18 @@ def test_candidates_with_within_are_those_of_trying_every_robot_everywhere(
         given["yaw_rad"] = data.draw(st.sampled_from([None, {"low": low, "high": low + 0.1}]))
     params = CandidateParams.model_validate(given)
     target_m = np.array([*MIDDLE, TABLE_TOP_M + 0.05])
+    reach = OneSide() if within == "in-range" and data.draw(st.booleans()) else None
     made, plain = (
-        draw(target_m, obstacles, params, np.random.default_rng(seed))
+        draw(target_m, obstacles, params, np.random.default_rng(seed), reach)
         for draw in (draw_candidates, plain_candidates)
     )
     assert (made is None) == (plain is None)
     if made is not None and plain is not None:
         assert (made.clearance_m >= 0).all()
-        assert within == "clear" or (distances(made, target_m)[1] <= made.arm_reach_m).all()
+        if reach is not None:
+            assert reach.holds(seen_from(made, target_m)).all()
+        elif within == "in-range":
+            assert (distances(made, target_m)[1] <= made.arm_reach_m).all()
         for name in (
             "base_xy_m",
             "base_yaw_rad",
