@@ -107,6 +107,9 @@ def specify(
     if spec.candidates.per_scene == "grid" and spec.candidates.within is not None:
         problem = f"a whole grid has cells that are not {spec.candidates.within}"
         raise InputError(place, "candidates.within", problem, "Give --candidates-per-scene 60")
+    if spec.scene.decisive is not None and spec.arm is None:
+        problem = f"{label_source} has no arm, and a scene is decisive for one"
+        raise InputError(place, "scene.decisive", problem, "Omit it, or submit plan or sim")
     footprint_m = spec.candidates.footprint_m
     if footprint_m is not None and crosses_itself(np.array(footprint_m)):
         raise InputError(place, "candidates.footprint_m", "crosses itself", "Give its corners in order")

@@ -76,7 +76,12 @@ def test_decisive_scenes_are_drawn_until_their_share_is_between_the_limits() -> 
             per_scene=10, within="in-range", arm_reach_m={"low": 0.947, "high": 0.947}
         ),
     )
-    world.object_names = ["005_tomato_soup_can", "009_gelatin_box", "013_apple", "077_rubiks_cube"]  # the grasps of each take seconds
+    world.object_names = [
+        "005_tomato_soup_can",
+        "009_gelatin_box",
+        "013_apple",
+        "077_rubiks_cube",
+    ]  # the grasps of each take seconds
     made = run_shard(world.spec, world, [0, 1])
     shares, draws = made.scene["good_share"], made.scene["decisive_draws"]
     for scene in (0, 1):
