@@ -95,7 +95,9 @@ def specify(
             candidates.setdefault("scaled_base", True)
         if label_source in ARM_PACKAGES and "within" not in candidates:
             candidates.setdefault("per_scene", "grid")
-        if candidates.get("per_scene") == "grid":
+        scene = fields.get("scene")
+        is_decisive = isinstance(scene, dict) and "decisive" in scene
+        if candidates.get("per_scene") == "grid" or is_decisive:
             # The cells of a whole grid are ranked against each other, so they have one robot.
             candidates.setdefault("robots_per_scene", 1)
     fields |= {
@@ -110,6 +112,9 @@ def specify(
     if spec.scene.decisive is not None and spec.arm is None:
         problem = f"{label_source} has no arm, and a scene is decisive for one"
         raise InputError(place, "scene.decisive", problem, "Omit it, or submit plan or sim")
+    if spec.scene.decisive is not None and spec.candidates.robots_per_scene > 1:
+        problem = f"{spec.candidates.robots_per_scene} robots, and a scene is decisive for one"
+        raise InputError(place, "candidates.robots_per_scene", problem, "Set it to 1")
     footprint_m = spec.candidates.footprint_m
     if footprint_m is not None and crosses_itself(np.array(footprint_m)):
         raise InputError(place, "candidates.footprint_m", "crosses itself", "Give its corners in order")

@@ -48,16 +48,13 @@ def draw_place(params: SceneParams, rng: np.random.Generator) -> tuple[PlaceKind
 
 
 def eligible_surfaces(house: House, params: SceneParams, kind: PlaceKind = "top") -> list[Surface]:
-    """Surfaces of a kind with room for a target: tops of the specified height, others up to its upper end."""
+    """Surfaces of a kind with room for a target, at the specified height where they are not the floor."""
     low, high = params.support_height_m.low, params.support_height_m.high
     narrowest_m = 0.3 if kind == "top" else NARROWEST_M
     return [
         s
         for s in house.surfaces
-        if s.kind == kind
-        and (kind != "top" or low <= s.height_m)
-        and s.height_m <= high
-        and min(s.size_m) >= narrowest_m
+        if s.kind == kind and (kind == "floor" or low <= s.height_m <= high) and min(s.size_m) >= narrowest_m
     ]
 
 
