@@ -95,9 +95,12 @@ def specify(
             candidates.setdefault("scaled_base", True)
         if label_source in ARM_PACKAGES and "within" not in candidates:
             candidates.setdefault("per_scene", "grid")
-        if label_source in ARM_PACKAGES and candidates.get("within") == "in-range" and _needs_set(chosen):
+        scene = fields.get("scene")
+        asked = scene if isinstance(scene, dict) else {}
+        is_arm = label_source in ARM_PACKAGES
+        if is_arm and candidates.get("within") == "in-range" and _needs_set(chosen, "places" in asked):
             candidates.setdefault("in_range_by", "reachable-set")
-        if candidates.get("per_scene") == "grid":
+        if candidates.get("per_scene") == "grid" or "decisive" in asked:
             # The cells of a whole grid are ranked against each other, so they have one robot.
             candidates.setdefault("robots_per_scene", 1)
     fields |= {
@@ -111,6 +114,12 @@ def specify(
         raise InputError(place, "candidates.within", problem, "Give --candidates-per-scene 60")
     if spec.candidates.in_range_by is not None:
         _prepare_set(spec, place)
+    if spec.scene.decisive is not None and spec.arm is None:
+        problem = f"{label_source} has no arm, and a scene is decisive for one"
+        raise InputError(place, "scene.decisive", problem, "Omit it, or submit plan or sim")
+    if spec.scene.decisive is not None and spec.candidates.robots_per_scene > 1:
+        problem = f"{spec.candidates.robots_per_scene} robots, and a scene is decisive for one"
+        raise InputError(place, "candidates.robots_per_scene", problem, "Set it to 1")
     footprint_m = spec.candidates.footprint_m
     if footprint_m is not None and crosses_itself(np.array(footprint_m)):
         raise InputError(place, "candidates.footprint_m", "crosses itself", "Give its corners in order")
@@ -127,11 +136,15 @@ def specify(
     return spec.model_copy(update={"engines": scene_engines(spec) | label_engines(spec.label_source)})
 
 
-def _needs_set(robot: str | None) -> bool:
+def _needs_set(robot: str | None, has_places: bool) -> bool:
+    """Whether candidates in range come from a reachable set: also where targets are as low as the floor."""
     # Opens the robot, for which labels without an arm lack libraries.
     from datagen.workers.motion.reachable_sampling import needs_set
 
-    return robot is not None and needs_set(robot)
+    if robot is None:
+        return False
+    low, high = robot_limits(robot).reach_m
+    return needs_set(robot) or (has_places and low == high)
 
 
 def _prepare_set(spec: Specification, place: str) -> None:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from datagen.schemas.errors import InputError, choices
-from datagen.schemas.specification import Specification
+from datagen.schemas.specification import PLACE_KINDS, Specification
 
 Table = Literal["scene", "sample"]
 TABLES: tuple[Table, Table] = ("scene", "sample")
@@ -55,7 +55,7 @@ OUTCOMES: dict[str, str] = {
 RETRY_OUTCOMES = ("none", *OUTCOMES)
 
 # Version of all schemas, and the oldest that is read.
-SCHEMA_VERSION, OLDEST_SCHEMA = 5, 4
+SCHEMA_VERSION, OLDEST_SCHEMA = 6, 4
 
 
 @dataclass(frozen=True)
@@ -161,11 +161,18 @@ SCENE_FIELDS = (
     Field("room_type", "string", (), "", "", "type of that room"),
     Field("support_id", "string", (), "", "", "support surface within the house"),
     Field("support_type", "string", (), "", "", "type of furniture that carries it"),
+    Field("place", "uint8", (), "1", "",
+          "kind of place where the objects stand", 0, len(PLACE_KINDS) - 1, PLACE_KINDS, since=6),
+    Field("good_share", "float32", (), "1", "",
+          "share of good labels among the clear candidates in reach; 0 where there are none", 0, 1, since=6),
+    Field("decisive_draws", "int32", (), "1", "",
+          "scenes labelled until good_share was between 0.05 and 0.6; 0 where any was taken", 0, since=6),
     Field("T_world_support", "float64", ("row", "column"), "m", "world",
           "support surface, origin at its centre, z up"),
     Field("support_size_m", "float32", ("xy",), "m", "support",
           "extent of the support rectangle", 0, _EXTENT),
-    Field("object_name", "string", ("object",), "", "", "objects on the support; the target is first"),
+    Field("object_name", "string", ("object",), "", "",
+          "objects on the support; the target is first; empty where fewer stand there"),
     Field("object_digest", "string", ("object",), "", "", "sha256 of what each object is made from"),
     Field("object_mass_kg", "float32", ("object",), "kg", "", "mass used by the physics", 0, 100),
     Field("T_world_object", "float64", ("object", "row", "column"), "m", "world", "settled object poses"),

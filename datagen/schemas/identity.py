@@ -21,6 +21,7 @@ class Stream(IntEnum):
     NOISE = 4
     PATH = 5
     DISTURBANCE = 6
+    PLACE = 10
     ARRIVAL = 9  # for no sample: poses at which robots arrive in a closed loop
 
 

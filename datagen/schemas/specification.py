@@ -26,9 +26,45 @@ class Source(Frozen):
     digest: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
+PlaceKind = Literal["top", "shelf", "inside", "seat", "floor", "sink"]
+PLACE_KINDS: tuple[PlaceKind, ...] = ("top", "shelf", "inside", "seat", "floor", "sink")
+
+
+class Places(Frozen):
+    """Shares of the scenes by the kind of place where the target stands; they need not sum to 1.
+
+    `top` is the open top of a table or chest, `shelf` an inner board, `inside` a cupboard, fridge or
+    microwave with its door open, `seat` a bed, sofa or chair, `floor` the floor beside and below furniture,
+    and `sink` the basin of a sink.
+    """
+
+    top: float = Field(default=0.0, ge=0, le=1000)
+    shelf: float = Field(default=0.0, ge=0, le=1000)
+    inside: float = Field(default=0.0, ge=0, le=1000)
+    seat: float = Field(default=0.0, ge=0, le=1000)
+    floor: float = Field(default=0.0, ge=0, le=1000)
+    sink: float = Field(default=0.0, ge=0, le=1000)
+
+    @model_validator(mode="after")
+    def _some(self) -> Places:
+        if not sum(self.weights().values()) > 0:
+            raise ValueError("no kind of place has a weight above 0")
+        return self
+
+    def weights(self) -> dict[str, float]:
+        """The weights by kind, in the order of `PLACE_KINDS`."""
+        return {kind: getattr(self, kind) for kind in PLACE_KINDS}
+
+
 class SceneParams(Frozen):
     """Choice of support surface, target and clutter."""
 
+    # Kinds of places with their weights. With it, doors of cupboards and fridges stand open, and clutter
+    # numbers 0 to n_clutter. None: tops alone, and n_clutter objects.
+    places: Places | None = None
+    # Share of the scenes that are drawn until between 5 and 60 % of their clear candidates in reach are
+    # good; None: none are.
+    decisive: Fraction | None = None
     n_clutter: int = Field(default=6, ge=0, le=30)
     support_height_m: Range = Range(low=0.3, high=1.2)
     # Clutter is dropped within this distance of the target, so that it sometimes occludes it.

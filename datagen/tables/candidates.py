@@ -79,7 +79,8 @@ _DERIVED: Mapping[str, tuple[tuple[str, ...], Callable[[_Rows], Array]]] = {
     ),
 }
 _DEFAULT = (
-    *("run", "scene_index", "candidate_index", "robot_index", "house", "split", "room_type", "support_type"),
+    *("run", "scene_index", "candidate_index", "robot_index", "house", "split", "room_type", "place"),
+    "support_type",
     *("object", "robot", "camera_height_m", "base_height_m", "arm_reach_m"),
     *("base_x_world_m", "base_y_world_m", "base_yaw_world_rad", "base_x_target_m", "base_y_target_m"),
     *("target_x_world_m", "target_y_world_m", "target_z_world_m", "distance_m", "mount_distance_m"),

@@ -4,7 +4,7 @@ draw a house, a support, a target and clutter   (resampled until accepted)
 settle them by physics
 sample base candidates
 observe one RGB-D frame                         (or reconstruct scene and candidates from a stored run)
-label the candidates
+label the candidates                            (and again with the next scene until one is decisive)
 check the batch against its schema
 """
 
@@ -18,20 +18,27 @@ from typing import Any
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import REDRAW_CAUSES, SceneRows, sized_schema
-from datagen.schemas.identity import sample_ids
+from datagen.schemas.fields import OUTCOMES, REDRAW_CAUSES, SceneRows, sized_schema
+from datagen.schemas.identity import Stream, generator, sample_ids
 from datagen.schemas.run_records import StageClock
-from datagen.schemas.specification import Specification
+from datagen.schemas.specification import PLACE_KINDS, Specification
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import LabelSource, load_label_source
 from datagen.workers.rendering import Camera
 from datagen.workers.scenes import Scene
 from datagen.workers.scenes.generate import generate_scene
+from datagen.workers.scenes.placement import draw_place
 from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_candidates, reconstruct_scene
 from datagen.workers.watched_clock import WatchedClock
 from datagen.workers.world import World
 
 Columns = dict[str, np.ndarray[Any, Any]]
+
+# Scenes are decisive where between these shares of the clear candidates in reach are good.
+DECISIVE = (0.05, 0.6)
+MOST_DECISIVE_DRAWS = 40
+# Values of fields that records of older stores lack.
+_OLD = {"place": 0, "decisive_draws": 0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,14 +73,14 @@ def run_shard(
     rows_of = [None] * len(scene_indices) if stored is None else stored
     for index, rows in zip(scene_indices, rows_of, strict=True):
         if rows is None:
-            scene, candidates = generate_scene(world, index, clock)
+            scene, candidates, labelled, draws = _labelled_scene(world, index, source, clock)
             redraws.update(scene.redraws)
-            record = scene_row(scene)
+            record = scene_row(scene, spec) | {"decisive_draws": draws}
         else:
             scene = _stored_scene(world, index, rows, clock)
-            candidates, record = reconstruct_candidates(rows.samples, scene), rows.record
-        labelled = source.label(scene, candidates, spec, clock)
-        scene_rows.append(record)
+            candidates = reconstruct_candidates(rows.samples, scene)
+            labelled, record = source.label(scene, candidates, spec, clock), {**_OLD, **rows.record}
+        scene_rows.append(record | {"good_share": good_share(candidates, labelled)})
         sample_blocks.append(candidate_columns(index, candidates, spec_hash, source) | labelled)
         clock.labels = sum(len(block["label"]) for block in sample_blocks)
 
@@ -95,9 +102,44 @@ def _stored_scene(world: World, index: int, rows: SceneRows, clock: StageClock) 
     return scene
 
 
-def scene_row(scene: Scene) -> dict[str, Any]:
-    """The scene's record, by field name."""
+def _labelled_scene(
+    world: World, index: int, source: LabelSource, clock: StageClock
+) -> tuple[Scene, SceneCandidates, Columns, int]:
+    """Scene `index` with its candidates and labels, and how many scenes were labelled until it was decisive.
+
+    The last is 0 where the specification takes the first scene. Trials are not run to decide.
+    """
+    spec = world.spec
+    if not draw_place(spec.scene, generator(spec.seed, Stream.PLACE, index))[1]:
+        scene, candidates = generate_scene(world, index, clock)
+        return scene, candidates, source.label(scene, candidates, spec, clock), 0
+    assert spec.arm is not None
+    plain = spec.arm.model_copy(update={"trial": None, "disturbance": None, "draws": None})
+    plan, plan_spec = load_label_source("plan"), spec.model_copy(update={"arm": plain})
+    scene = None
+    for draws in range(1, MOST_DECISIVE_DRAWS + 1):
+        scene, candidates = generate_scene(world, index, clock, scene)
+        labelled = plan.label(scene, candidates, plan_spec, clock)
+        if DECISIVE[0] <= good_share(candidates, labelled) <= DECISIVE[1] or draws == MOST_DECISIVE_DRAWS:
+            if source.name != "plan" or plan_spec != spec:
+                labelled = source.label(scene, candidates, spec, clock)
+            return scene, candidates, labelled, draws
+    raise AssertionError
+
+
+def good_share(candidates: SceneCandidates, labelled: Columns) -> float:
+    """Share of positive labels among the candidates that are clear and in reach; 0 where there are none."""
+    among = candidates.clearance_m >= 0
+    if "outcome" in labelled:
+        among &= labelled["outcome"] != list(OUTCOMES).index("out_of_reach")
+    return float(labelled["label"][among].mean()) if among.any() else 0.0
+
+
+def scene_row(scene: Scene, spec: Specification) -> dict[str, Any]:
+    """The scene's record, by field name, without what depends on its labels."""
     house, surface, camera, cloud = scene.house.house, scene.surface, scene.camera, scene.cloud
+    # Rows have as many objects as the specification allows.
+    free = 1 + spec.scene.n_clutter - len(scene.models)
     return {
         "scene_index": scene.index,
         "retry": scene.retry,
@@ -108,12 +150,13 @@ def scene_row(scene: Scene) -> dict[str, Any]:
         "room_type": house.room(surface.room_id).room_type,
         "support_id": surface.surface_id,
         "support_type": surface.object_type,
+        "place": PLACE_KINDS.index(surface.kind),
         "T_world_support": surface.T_world_surface,
         "support_size_m": surface.size_m,
-        "object_name": [m.name for m in scene.models],
-        "object_digest": [m.digest for m in scene.models],
-        "object_mass_kg": [m.mass_kg for m in scene.models],
-        "T_world_object": scene.T_world_object,
+        "object_name": [m.name for m in scene.models] + [""] * free,
+        "object_digest": [m.digest for m in scene.models] + [""] * free,
+        "object_mass_kg": [m.mass_kg for m in scene.models] + [0.0] * free,
+        "T_world_object": np.concatenate([scene.T_world_object, np.tile(np.eye(4), (free, 1, 1))]),
         "settle_steps": scene.settled.steps,
         "residual_speed_mps": scene.settled.residual_speed_mps,
         "penetration_m": scene.settled.penetration_m,

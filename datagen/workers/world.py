@@ -68,7 +68,10 @@ class World:
         if house_id in self._bad_houses:
             raise InputError(*self._bad_houses[house_id])
         try:
-            prepared = PreparedHouse(self.houses.load(house_id))
+            house = self.houses.load(house_id)
+            if self.spec.scene.places is not None and house.open_doors is not None:
+                house = house.open_doors()
+            prepared = PreparedHouse(house)
         except InputError as error:
             # Stored, because later tries may draw the same house.
             self._bad_houses[house_id] = (error.place, error.field, error.problem, error.fix)

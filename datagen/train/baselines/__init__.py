@@ -8,7 +8,14 @@ from datagen.schemas.errors import InputError, choices
 from datagen.schemas.specification import HeuristicParams
 from datagen.train.baselines.baseline import FIELDS, Baseline
 from datagen.train.baselines.reachability import Reachability
-from datagen.train.baselines.rules import Analytic, DistanceBand, Proximity, Threshold, ThresholdVisibility
+from datagen.train.baselines.rules import (
+    Analytic,
+    DistanceBand,
+    Proximity,
+    ReachShare,
+    Threshold,
+    ThresholdVisibility,
+)
 from datagen.train.baselines.scalars import Scalars
 from datagen.train.inputs import Array, Batch
 from datagen.workers.robots import ROBOTS
@@ -16,6 +23,7 @@ from datagen.workers.robots import ROBOTS
 # By the name on the command line.
 BASELINES: dict[str, Callable[[], Baseline]] = {
     "proximity": Proximity,
+    "reach-share": ReachShare,
     "threshold": Threshold,
     "threshold-visibility": ThresholdVisibility,
     "distance": DistanceBand,

@@ -1,4 +1,4 @@
-"""Baselines that are rules: proximity, threshold (both of the paper), by visibility, analytic, distance."""
+"""Baselines that are rules on distances, visibility and clearance."""
 
 from __future__ import annotations
 
@@ -25,6 +25,9 @@ from datagen.train.scorers import scored
 from datagen.workers.labels.distance_visibility_score import heuristic
 
 
+_BEST_SHARE, _SHARE_WIDTH = 0.75, 0.1
+
+
 class Proximity(Unfitted):
     """Without threshold: a robot's nearest clear candidate is positive, its others are negative."""
 
@@ -45,6 +48,21 @@ class Threshold(Unfitted):
     def score(self, batch: Batch[Array]) -> F64:
         """1 or 0 (N,)."""
         return is_feasible(batch).astype(float)
+
+
+class ReachShare(Unfitted):
+    """What an integrator writes in an afternoon: clear, and the mount at 0.75 of the reach from the target.
+
+    The threshold is for 0.65 to 0.85 of the reach.
+    """
+
+    name = "reach-share"
+    threshold = 0.0
+
+    def score(self, batch: Batch[Array]) -> F64:
+        """0.1 - |mount distance / reach - 0.75| (N,), minus `RULED_OUT` where the base is not clear."""
+        apart = np.abs(mount_m(batch) / reach_m(batch) - _BEST_SHARE)
+        return _SHARE_WIDTH - apart - np.where(is_clear(batch), 0.0, RULED_OUT)
 
 
 @dataclass(frozen=True)

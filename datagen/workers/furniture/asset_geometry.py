@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 from datagen.workers.furniture import furniture_shapes as f
+from datagen.workers.furniture import open_shapes as o
 from datagen.workers.furniture import small_shapes as s
 from datagen.workers.furniture.assets import Asset
 from datagen.workers.furniture.solids import ColouredSolid, Rgb, join, pick
@@ -107,19 +108,33 @@ SHAPES: dict[str, tuple[Shape, tuple[Rgb, ...]]] = {
     "WineBottle": (s.bottle, _GLASS),
 }
 
+# Shapes with their doors open, of the types that have doors.
+_OPEN: dict[str, Shape] = {
+    "Cabinet": o.open_cupboard,
+    "CounterTop": o.open_counter,
+    "Dresser": o.open_cupboard,
+    "Fridge": o.open_fridge,
+    "Microwave": o.open_microwave,
+}
+
 # Anything thinner is a plain box: its details would be solids without volume.
 _DETAIL_M = 0.02
 _THINNEST_M = 0.004
 
 
 @lru_cache(maxsize=8192)
-def asset_geometry(asset: Asset) -> tuple[Mesh, tuple[F32, ...]]:
-    """Mesh and convex parts in the asset's own frame, base at z = 0. Shared: never write to them."""
+def asset_geometry(asset: Asset, is_open: bool = False) -> tuple[Mesh, tuple[F32, ...]]:
+    """Mesh and convex parts in the asset's own frame, base at z = 0. Shared: never write to them.
+
+    With `is_open`, the doors of cupboards, fridges and microwaves stand open.
+    """
     width, depth, height = (max(side, _THINNEST_M) for side in asset.size_m)
     asset = replace(asset, size_m=(width, depth, height))
     shape, palette = SHAPES.get(asset.object_type, (_by_proportions(asset), _PLASTIC))
     if min(asset.size_m) < _DETAIL_M and asset.object_type != "Painting":
         shape = s.block
+    elif is_open:
+        shape = _OPEN.get(asset.object_type, shape)
     mesh, parts_m = join(shape(asset, pick(palette, asset.asset_id)))
     for array in (mesh.vertices_m, mesh.faces, mesh.face_rgb, *parts_m):
         array.setflags(write=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from datagen.workers.furniture.assets import Asset, hutch_depth_m, top_height_m, top_rectangles
 from datagen.workers.furniture.solids import (
     ColouredSolid,
@@ -52,8 +54,11 @@ def side_table(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     return [*table(asset, rgb), lower]
 
 
-def counter(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
-    """Cupboards on a plinth below a worktop, along every run of an I, L or U."""
+def counter(asset: Asset, rgb: Rgb, opened: Sequence[tuple[float, float]] = ()) -> list[ColouredSolid]:
+    """Cupboards on a plinth below a worktop, along every run of an I, L or U.
+
+    The columns `opened` of the back run, intervals along x, are left out.
+    """
     top = top_height_m(asset)
     cupboard, worktop = rgb, shade((176, 172, 166), 0.8 + 0.4 * hash_bytes(asset.asset_id)[3] / 255)
     solids: list[ColouredSolid] = []
@@ -65,29 +70,26 @@ def counter(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
         solids.append(box(x, y, (0.0, 0.1), shade(cupboard, 0.55)))
         x = (r.x[0] + front[0] / 3, r.x[1] - front[1] / 3)
         y = (r.y[0] + front[2] / 3, r.y[1] - front[3] / 3)
-        solids.append(box(x, y, (0.1, top - 0.04), cupboard))
+        ends = [x[0], *(end for column in opened for end in column), x[1]] if k == 0 else [*x]
+        pairs = [(low, high) for low, high in zip(ends[::2], ends[1::2], strict=True) if high - low > 1e-3]
+        solids.extend(box(pair, y, (0.1, top - 0.04), cupboard) for pair in pairs)
         solids.append(box(r.x, r.y, (top - 0.04, top), worktop))
-    solids.extend(_cupboard_doors(asset, top, shade(cupboard, 1.08)))
+    columns, leaf = cupboard_columns(asset)
+    for low, high in columns:
+        if (low, high) not in opened:
+            x, z = (low + 0.01, high - 0.01), (0.12, top - 0.06)
+            solids.append(box(x, (leaf, leaf + 0.012), z, shade(cupboard, 1.08)))
     return solids
 
 
-def _cupboard_doors(asset: Asset, top: float, rgb: Rgb) -> list[ColouredSolid]:
-    """Door leaves in front of the part of the back run that no wing hides."""
+def cupboard_columns(asset: Asset) -> tuple[list[tuple[float, float]], float]:
+    """The columns of the back run of a counter that no wing hides, along x, and the y of their fronts."""
     runs = top_rectangles(asset)
     low = runs[2].x[1] if len(runs) == 3 else runs[0].x[0]
     high = runs[1].x[0] if len(runs) > 1 else runs[0].x[1]
     count = max(1, min(6, round((high - low) / 0.5)))
     step = (high - low) / count
-    front = runs[0].y[1] - 0.02
-    return [
-        box(
-            (low + k * step + 0.01, low + (k + 1) * step - 0.01),
-            (front, front + 0.012),
-            (0.12, top - 0.06),
-            rgb,
-        )
-        for k in range(count)
-    ]
+    return [(low + k * step, low + (k + 1) * step) for k in range(count)], runs[0].y[1] - 0.02
 
 
 def desk(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:

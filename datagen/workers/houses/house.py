@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal, Protocol
 
 import numpy as np
 
+from datagen.schemas.specification import PlaceKind
 from datagen.workers.geometry.mesh import F32, F64, Mesh
 
 BodyKind = Literal["wall", "furniture", "small"]
@@ -53,6 +54,7 @@ class Surface:
     room_id: str
     T_world_surface: F64  # (4, 4)
     size_m: tuple[float, float]  # along the surface frame's x and y
+    kind: PlaceKind = "top"
 
     @property
     def height_m(self) -> float:
@@ -70,6 +72,8 @@ class House:
     surfaces: tuple[Surface, ...]
     # Things that are left out or implausible, counted by cause.
     findings: Mapping[str, int] = field(default_factory=dict)
+    # Builds it with open doors and all kinds of places; None where the source knows only tops.
+    open_doors: Callable[[], House] | None = None
 
     @cached_property
     def parts_m(self) -> list[F32]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.houses.house import House, Room, StaticBody, Surface
 from datagen.workers.houses.plausibility import NO_WALL, refuse_implausible
-from datagen.workers.houses.things import Thing, read_things, top_surfaces
+from datagen.workers.houses.things import Thing, other_surfaces, read_things, top_surfaces
 from datagen.workers.houses.walls_and_floors import (
     MAX_CORNERS,
     WINDOW_SILL_M,
@@ -76,18 +77,25 @@ def read_house(root: JsonNode, assets: Mapping[str, Asset]) -> HouseRecord:
 
 def build_house(root: JsonNode, house_id: str, digest: str, assets: Mapping[str, Asset]) -> House:
     """The house of one document. Raises InputError as `read_house` does."""
-    record = read_house(root, assets)
+    return _assemble(read_house(root, assets), house_id, digest, is_open=False)
+
+
+def _assemble(record: HouseRecord, house_id: str, digest: str, is_open: bool) -> House:
     owners = room_ids_at(np.array([t.room_xy for t in record.things]).reshape(-1, 2), record.rooms)
     bodies: list[StaticBody] = []
     surfaces: list[Surface] = []
     for thing, owner in zip(record.things, owners, strict=True):
-        mesh, parts_m = placed(*asset_geometry(thing.asset), thing.T_world_asset)
+        mesh, parts_m = placed(*asset_geometry(thing.asset, is_open), thing.T_world_asset)
         object_type, asset_id = thing.asset.object_type, thing.asset.asset_id
         bodies.append(StaticBody(thing.body_id, thing.kind, object_type, asset_id, owner, mesh, parts_m))
         if owner and thing.kind == "furniture" and thing.is_upright:
             surfaces.extend(top_surfaces(thing, owner))
+        if is_open and owner and thing.is_upright:
+            surfaces.extend(other_surfaces(thing, owner))
     everything = (*record.floors, *wall_bodies(list(record.walls.values()), record.holes), *bodies)
-    return House(house_id, digest, tuple(record.rooms), everything, tuple(surfaces), record.findings)
+    opener = None if is_open else partial(_assemble, record, house_id, digest, is_open=True)
+    rooms = tuple(record.rooms)
+    return House(house_id, digest, rooms, everything, tuple(surfaces), record.findings, opener)
 
 
 def room_ids_at(points_m: F64, rooms: list[Room]) -> list[str]:

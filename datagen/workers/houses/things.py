@@ -20,6 +20,7 @@ from datagen.workers.furniture.assets import (
     top_height_m,
     top_rectangles,
 )
+from datagen.workers.furniture.places import floor_around, places_of
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.houses.house import BodyKind, Surface
 from datagen.workers.json_document import JsonNode
@@ -33,6 +34,8 @@ _UPRIGHT_DEG = 2.0
 _HANGS_M = 0.12
 _SINKS_M = 0.03
 _NARROWEST_M = 0.1
+# Furniture that begins below this stands on the floor, and one of these sides stands in the way of a robot.
+_ON_FLOOR_M, _BULKY_M = 0.1, 0.35
 _SWAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 
@@ -158,6 +161,24 @@ def _rested(T: F64, small: Asset, below: Asset, T_below: F64) -> tuple[F64, floa
         T[2, 3] -= gap
         lowest -= gap
     return T, lowest - (T_below[2, 3] + max(levels))
+
+
+def other_surfaces(thing: Thing, room_id: str) -> list[Surface]:
+    """Surfaces of the other kinds of places: of the asset with open doors, and of the floor around it."""
+    places = places_of(thing.asset)
+    stands = thing.kind == "furniture" and thing.T_world_asset[2, 3] < _ON_FLOOR_M
+    if stands and min(thing.asset.size_m) >= _BULKY_M:
+        places += (floor_around(thing.asset),)
+    out: list[Surface] = []
+    for k, place in enumerate(places):
+        T = thing.T_world_asset.copy()
+        T[:3, 3] += T[:3, :3] @ (*place.rectangle.centre_m, place.height_m)
+        if place.kind == "floor":
+            T[2, 3] = 0.0
+        surface_id, object_type = f"{thing.body_id}/{place.kind}{k}", thing.asset.object_type
+        size_m = place.rectangle.size_m
+        out.append(Surface(surface_id, thing.body_id, object_type, room_id, T, size_m, place.kind))
+    return out
 
 
 def top_surfaces(thing: Thing, room_id: str) -> list[Surface]:

@@ -22,10 +22,14 @@ if TYPE_CHECKING:  # they load renderers, which a base installation lacks
 VERSION = 1
 # The same for specifications with `candidates.within`. 2: robots are drawn given that the target has room.
 VERSION_WITHIN = 2
+# The same for specifications with `scene.places`.
+VERSION_PLACES = 3
 
 
 def scenes_version(spec: Specification) -> int:
     """The version of the scenes that this specification gives."""
+    if spec.scene.places is not None:
+        return VERSION_PLACES
     return VERSION if spec.candidates.within is None else VERSION_WITHIN
 
 

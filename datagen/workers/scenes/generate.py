@@ -27,10 +27,11 @@ from datagen.workers.scenes import Scene
 from datagen.workers.scenes.placement import (
     SceneRejected,
     describe_surfaces,
+    draw_place,
     drop_poses,
     eligible_surfaces,
     nearby_parts,
-    standing_footprints,
+    standing_parts,
 )
 from datagen.workers.settling import SettleResult, load_settler
 from datagen.workers.world import PreparedHouse, World
@@ -68,13 +69,20 @@ _CAUSES = {
 }
 
 
-def generate_scene(world: World, index: int, clock: StageClock) -> tuple[Scene, SceneCandidates]:
+def generate_scene(
+    world: World, index: int, clock: StageClock, after: Scene | None = None
+) -> tuple[Scene, SceneCandidates]:
     """Sample scene `index` of the specification and its candidates: the first accepted try.
 
-    Raises InputError after `scene.max_retries` rejections.
+    `after` is an earlier scene of this index, which another is to replace. Raises InputError after
+    `scene.max_retries` rejections.
     """
     redraws, details = Counter[str](), dict[str, str]()
-    for retry in range(world.spec.scene.max_retries):
+    first = 0
+    if after is not None:
+        redraws.update(after.redraws)
+        first = after.retry + 1
+    for retry in range(first, first + world.spec.scene.max_retries):
         try:
             return _try_scene(world, index, retry, dict(redraws), clock)
         except SceneRejected as rejection:
@@ -94,16 +102,21 @@ def _try_scene(
 ) -> tuple[Scene, SceneCandidates]:
     spec = world.spec
     with clock.stage("draw"):
+        kind, _ = draw_place(spec.scene, generator(spec.seed, Stream.PLACE, index))
         rng = generator(spec.seed, Stream.SCENE, index, retry)
         house = _load_house(world, world.house_ids[rng.integers(len(world.house_ids))])
-        surfaces = eligible_surfaces(house.house, spec.scene)
+        surfaces = eligible_surfaces(house.house, spec.scene, kind)
         if not surfaces:
-            raise SceneRejected("no_surface", describe_surfaces(house.house, spec.scene))
+            raise SceneRejected("no_surface", describe_surfaces(house.house, spec.scene, kind))
         surface = surfaces[rng.integers(len(surfaces))]
         names = _draw_names(world, rng, clock)
+        standing = standing_parts(house.house, surface)
+        room_m = house.house.room(surface.room_id).polygon_m if kind == "floor" else None
+        kept, start = drop_poses(
+            [world.object(name) for name in names], surface, standing, spec.scene, rng, room_m
+        )
+        names = [names[k] for k in kept]
         models = tuple(world.object(name) for name in names)
-        taken = standing_footprints(house.house, surface)
-        start = drop_poses(models, surface, taken, spec.scene, rng)
         static = nearby_parts(house.house, surface, _SURROUNDINGS_M)
 
     with clock.stage("settle"):
@@ -158,7 +171,9 @@ def _draw_names(world: World, rng: np.random.Generator, clock: StageClock) -> li
     with clock.stage("draw" if world.spec.arm is None else "grasps"):
         target = world.draw_target(rng)
     others = [name for name in world.object_names if name != target]
-    clutter = rng.choice(len(others), size=world.spec.scene.n_clutter, replace=False)
+    scene = world.spec.scene
+    size = scene.n_clutter if scene.places is None else int(rng.integers(scene.n_clutter + 1))
+    clutter = rng.choice(len(others), size=size, replace=False)
     return [target, *(others[k] for k in clutter)]
 
 

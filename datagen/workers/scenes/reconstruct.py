@@ -80,8 +80,11 @@ def reconstruct_scene(world: World, record: Record) -> ReconstructedScene:
     house = world.house(str(record["house_id"]))
     _check_digest(house.house.house_id, house.house.digest, str(record["house_digest"]))
     names = [str(name) for name in record["object_name"]]
+    while len(names) > 1 and not names[-1]:  # rows of scenes with fewer objects end with empty names
+        names.pop()
+    T_world_object = T_world_object[: len(names)]
     models = tuple(world.object(name) for name in names)
-    for model, digest in zip(models, record["object_digest"], strict=True):
+    for model, digest in zip(models, record["object_digest"], strict=False):
         _check_digest(model.name, model.digest, str(digest))
     camera = Camera(T_world_camera, width, height, fx, fy, cx, cy)
     rays = world.ray_scene(house, names, T_world_object)

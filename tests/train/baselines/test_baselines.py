@@ -21,9 +21,11 @@ from datagen.train.baselines.baseline import (
     calibrate,
     is_feasible,
     observed_rho,
+    mount_m,
     planar_distance_m,
+    reach_m,
 )
-from datagen.train.baselines.rules import Analytic, DistanceBand, Proximity, ThresholdVisibility
+from datagen.train.baselines.rules import Analytic, DistanceBand, Proximity, ReachShare, ThresholdVisibility
 from datagen.train.baselines.scalars import FAR_M, FEATURES, Scalars, features, observed_clearance_m
 from datagen.train.dataset import SampleStream
 from datagen.train.inputs import F64, Batch, is_clear
@@ -66,6 +68,20 @@ def test_closer_is_better_by_proximity_and_never_infeasible_by_threshold(seed: i
     assert (Proximity().score(closer) > Proximity().score(batch)).all()
     geometric = BASELINES["threshold"]()
     assert (geometric.score(closer) >= geometric.score(batch)).all()
+
+
+@given(st.integers(0, 2**32))
+@settings(max_examples=20, deadline=None)
+def test_reach_share_prefers_clear_bases_at_three_quarters_of_the_reach(seed: int) -> None:
+    batch = make_batch(seed % 1000)
+    score, clear = ReachShare().score(batch), batch.extra["base_is_clear"].astype(bool)
+    share = mount_m(batch) / reach_m(batch)
+    if clear.any():
+        best = np.flatnonzero(clear)[np.abs(share[clear] - 0.75).argmin()]
+        assert score[best] == score.max()
+    assert not (score[~clear] >= ReachShare.threshold).any()
+    near = clear & (np.abs(share - 0.75) < 0.0999)
+    assert (score[near] >= ReachShare.threshold).all()
 
 
 def test_proximity_picks_the_nearest_clear_one_and_threshold_those_within_reach() -> None:
