@@ -18,7 +18,6 @@ from datagen.evaluation.grids import (
     AT_RANDOM,
     BY_LABELS,
     DISTANCES_M,
-    HARD_SHARE,
     PICKS,
     GridMaps,
     grid_maps,
@@ -187,7 +186,7 @@ def _distinct(candidates: Sequence[I64], offsets: F64) -> tuple[Arrived, ...]:
 
 
 def loop_record(loop: Loop, methods: Sequence[Method]) -> dict[str, Any]:
-    """The numbers of a loop whose arrivals are all made, over all scenes and over the hard ones."""
+    """The numbers of a loop whose arrivals are all made, over all scenes and over the decisive ones."""
     known = [read_outcomes(task.path) for task in loop.tasks]
     outcomes = {
         pick: np.array(
@@ -200,14 +199,13 @@ def loop_record(loop: Loop, methods: Sequence[Method]) -> dict[str, Any]:
         for pick, cells in loop.cells.items()
     }
     weights = weights_for(loop.columns, RESAMPLES, SEED)
-    _, hard = mixed_grids(loop.columns)
+    _, decisive = mixed_grids(loop.columns)
     table = partial(loop_table, outcomes, loop.arrivals, methods, weights)
-    sides = {"all": np.ones(len(hard), np.bool_), "hard": hard}
+    sides = {"all": np.ones(len(decisive), np.bool_), "decisive": decisive}
     return {
         "mode": loop.mode,
         "arrivals_per_scene": int(loop.offsets.shape[2]),
         "scenes_without_good": loop.without_good,
-        "hard_share": HARD_SHARE,
         "arrivals": {
             "wanted": sum(each.size for each in outcomes.values()),
             "distinct": sum(len(task.arrivals) for task in loop.tasks),

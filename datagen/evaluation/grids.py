@@ -15,14 +15,13 @@ from scipy.spatial import KDTree
 
 from datagen.evaluation.columns import Columns
 from datagen.evaluation.comparisons import Method
+from datagen.schemas.specification import DECISIVE_SHARES
 from datagen.schemas.stored_arrays import facing_rad
 from datagen.train.arrivals import Arrival, expected_success, ring_arrival, stands
 from datagen.train.bootstrap import Estimate, Weights, summed
 from datagen.train.inputs import F64, Bools, Ints
 from datagen.train.metrics import average_precision, ratio
 
-# A grid is hard where at most this share of its clear cells is good.
-HARD_SHARE = 0.2
 # Picks without a method: by the labels of the whole grid, and at random.
 BY_LABELS, AT_RANDOM = "best by labels", "random in reach"
 # Distances at which robots stop from the goal, in any direction.
@@ -31,11 +30,14 @@ PICKS = ("nominal", "smoothed")
 
 
 def mixed_grids(columns: Columns) -> tuple[Bools, Bools]:
-    """Masks (S,) of the scenes with good and bad clear cells, and of those of them that are hard."""
+    """Masks (S,) of the scenes with good and bad clear cells, and of those of them that are decisive."""
     clear = np.bincount(columns.scene, columns.is_clear, columns.n_scenes)
     good = np.bincount(columns.scene, columns.is_clear & columns.label, columns.n_scenes)
+    near = np.bincount(columns.scene, columns.is_in("in-range"), columns.n_scenes)
+    good_near = np.bincount(columns.scene, columns.is_in("in-range") & columns.label, columns.n_scenes)
+    low, high = DECISIVE_SHARES
     both = (good > 0) & (good < clear)
-    return both, both & (good <= HARD_SHARE * clear)
+    return both, both & (good_near >= low * near) & (good_near <= high * near)
 
 
 def picks(score: F64, group: Ints, allowed: Bools) -> F64:

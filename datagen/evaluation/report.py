@@ -58,9 +58,9 @@ def parts_by_houses(
 
 
 def parts_of_grids(name: str, columns: Columns) -> list[Part]:
-    """The grids with good and bad clear cells, and those of them that are hard, where there are some."""
-    mixed, hard = mixed_grids(columns)
-    sides = (("mixed", mixed), ("hard", hard))
+    """The grids with good and bad clear cells, and those of them that are decisive, where there are some."""
+    mixed, decisive = mixed_grids(columns)
+    sides = (("mixed", mixed), ("decisive", decisive))
     return [Part(f"{name}, {text}", columns.of_scenes(rows), {}) for text, rows in sides if rows.any()]
 
 

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from datagen.evaluation.grids import AT_RANDOM, BY_LABELS, HARD_SHARE, PICKS
+from datagen.evaluation.grids import AT_RANDOM, BY_LABELS, PICKS
+from datagen.schemas.specification import DECISIVE_SHARES
 
 Report = Mapping[str, Any]
 DECISIONS = ("accuracy", "balanced_accuracy", "area_under_roc")
@@ -25,6 +26,7 @@ SET_WORDS = {
     "clear": "clear",
     "grid": "all cells; methods know where the base collides",
 }
+_DECISIVE = "{:.0%} to {:.0%} of the clear cells in reach are good".format(*DECISIVE_SHARES)
 _TRIALS = {
     "plan": "arrives off its pick and plans from there",
     "sim": "arrives off its pick, plans from there and executes in a disturbed world",
@@ -176,10 +178,8 @@ def loop_tables(report: Report) -> Iterator[Table]:
             for k, pick in enumerate(picks)
         ]  # fmt: skip
         title = f"success (%) in {part['scenes']} scenes: the robot {_TRIALS[loop['mode']]}"
-        if part["scenes_of"] == "hard":
-            title = (
-                f"the same in {part['scenes']} scenes with at most {loop['hard_share']:.0%} good clear cells"
-            )
+        if part["scenes_of"] == "decisive":
+            title = f"the same in {part['scenes']} decisive scenes: {_DECISIVE}"
         errors = [row["arrival"].removesuffix(" off") for row in part["table"]]
         yield Table(title, ("method", "pick", *errors), rows)
     whole = loop["parts"][0]["table"]
@@ -260,7 +260,7 @@ def _benchmark_notes(benchmark: Report | None) -> Iterator[tuple[str, str]]:
             else "not frozen: its candidates and labels were not compared"
         )
         yield name, f"{run['about']}; {frozen}"
-    yield "grids", f"mixed: good and bad clear cells; hard: at most {HARD_SHARE:.0%} of the clear cells good"
+    yield "grids", f"mixed: good and bad clear cells; decisive: {_DECISIVE}"
     if benchmark["not_scored"]:
         yield "not scored", f"{', '.join(benchmark['not_scored'])}: every row is incomplete"
 

@@ -15,6 +15,8 @@ from pydantic import Field, model_validator
 from datagen.schemas.identity import digest_of
 from datagen.schemas.intervals import Corner, Fraction, Frozen, Interval, Metres, Range, Turns
 
+# Scenes are decisive where between these shares of the clear candidates in reach are good.
+DECISIVE_SHARES = (0.05, 0.6)
 # The reach that Franka Emika states for the Panda.
 PANDA_REACH_M = 0.855
 

@@ -21,7 +21,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import OUTCOMES, REDRAW_CAUSES, SceneRows, sized_schema
 from datagen.schemas.identity import Stream, generator, sample_ids
 from datagen.schemas.run_records import StageClock
-from datagen.schemas.specification import PLACE_KINDS, Specification
+from datagen.schemas.specification import DECISIVE_SHARES, PLACE_KINDS, Specification
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import LabelSource, load_label_source
 from datagen.workers.rendering import Camera
@@ -34,8 +34,6 @@ from datagen.workers.world import World
 
 Columns = dict[str, np.ndarray[Any, Any]]
 
-# Scenes are decisive where between these shares of the clear candidates in reach are good.
-DECISIVE = (0.05, 0.6)
 MOST_DECISIVE_DRAWS = 40
 # Values of fields that records of older stores lack.
 _OLD = {"place": 0, "decisive_draws": 0}
@@ -120,7 +118,8 @@ def _labelled_scene(
     for draws in range(1, MOST_DECISIVE_DRAWS + 1):
         scene, candidates = generate_scene(world, index, clock, scene)
         labelled = plan.label(scene, candidates, plan_spec, clock)
-        if DECISIVE[0] <= good_share(candidates, labelled) <= DECISIVE[1] or draws == MOST_DECISIVE_DRAWS:
+        low, high = DECISIVE_SHARES
+        if low <= good_share(candidates, labelled) <= high or draws == MOST_DECISIVE_DRAWS:
             if source.name != "plan" or plan_spec != spec:
                 labelled = source.label(scene, candidates, spec, clock)
             return scene, candidates, labelled, draws

@@ -24,7 +24,6 @@ from datagen.train.inputs import F64, Array, Batch, Bools, is_clear
 from datagen.train.scorers import scored
 from datagen.workers.labels.distance_visibility_score import heuristic
 
-
 _BEST_SHARE, _SHARE_WIDTH = 0.75, 0.1
 
 

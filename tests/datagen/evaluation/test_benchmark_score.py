@@ -90,9 +90,10 @@ def test_grids_with_good_and_bad_cells_and_hard_ones_are_parts_of_their_own(
     stored = arrays_of(small_benchmark / "grids")
     scenes = stored["sample_scene_index"]
     clear, good = stored["base_is_clear"], stored["label"] == 1
-    counts = [(clear[scenes == s].sum(), (clear & good)[scenes == s].sum()) for s in np.unique(scenes)]
-    shares = [share for share in (g / c for c, g in counts if c) if 0 < share < 1]
-    expected = {"grids, mixed": len(shares), "grids, hard": sum(share <= 0.2 for share in shares)}
+    near = clear & (stored["mount_distance_m"] <= stored["arm_reach_m"])
+    mixed = [s for s in np.unique(scenes) if 0 < good[clear & (scenes == s)].mean() < 1]
+    shares = [good[near & (scenes == s)].mean() for s in mixed]
+    expected = {"grids, mixed": len(mixed), "grids, decisive": sum(0.05 <= s <= 0.6 for s in shares)}
     parts = {part["title"]: part["grids"] for part in report["parts"]}
     assert {title: grids["scenes"] for title, grids in parts.items()} == {
         title: n for title, n in expected.items() if n

@@ -182,7 +182,14 @@ def test_baselines_are_fitted_only_in_other_houses(
     words = ["evaluate", str(grids)]
     report = json_of(capsys, words)
     names = [method["name"] for method in report["methods"]]
-    assert names == ["proximity", "threshold", "threshold-visibility", "analytic", "reachability"]
+    assert names == [
+        "proximity",
+        "reach-share",
+        "threshold",
+        "threshold-visibility",
+        "analytic",
+        "reachability",
+    ]
     assert set(report["left_out"]) == {"distance", "scalars"}
     assert all("--fit" in why for why in report["left_out"].values())
     stored = arrays_of(grids)

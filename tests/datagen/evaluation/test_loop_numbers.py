@@ -92,8 +92,8 @@ def test_a_drift_ahead_follows_the_heading_of_the_base() -> None:
 
 def test_rates_are_means_over_scenes_with_their_causes_and_gains() -> None:
     columns = make_grids(*lonely_and_wide())
-    _, hard = mixed_grids(columns)
-    assert hard.all()  # 26 of 169 cells
+    _, decisive = mixed_grids(columns)
+    assert decisive.all()  # 26 of 169 cells
     good, bad = ["success"] * 2, ["no_ik", "success"]
     nominal = np.array([[bad, bad, good, ["no_lift", "no_ik"]]], object)
     smoothed = np.array([[good, good, good, bad]], object)

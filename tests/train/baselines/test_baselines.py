@@ -20,8 +20,8 @@ from datagen.train.baselines.baseline import (
     best_cut,
     calibrate,
     is_feasible,
-    observed_rho,
     mount_m,
+    observed_rho,
     planar_distance_m,
     reach_m,
 )

@@ -7,6 +7,7 @@ import pytest
 
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.specification import (
+    DECISIVE_SHARES,
     PLACE_KINDS,
     ArmParams,
     CandidateParams,
@@ -20,7 +21,7 @@ from datagen.schemas.specification import (
 )
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
-from datagen.workers.run_shard import DECISIVE, MOST_DECISIVE_DRAWS, run_shard
+from datagen.workers.run_shard import MOST_DECISIVE_DRAWS, run_shard
 from datagen.workers.scenes.reconstruct import reconstruct_scene
 from datagen.workers.world import World, assemble_world
 
@@ -87,7 +88,7 @@ def test_decisive_scenes_are_drawn_until_their_share_is_between_the_limits() -> 
     for scene in (0, 1):
         labels = _samples(made.sample, scene)["label"]
         assert 1 <= draws[scene] <= MOST_DECISIVE_DRAWS
-        within = DECISIVE[0] <= shares[scene] <= DECISIVE[1]
+        within = DECISIVE_SHARES[0] <= shares[scene] <= DECISIVE_SHARES[1]
         assert within or draws[scene] == MOST_DECISIVE_DRAWS
         assert 0 < labels.mean() <= shares[scene] + 1e-6
     free = world_of(world.spec.scene.model_copy(update={"decisive": 0.0}))
