@@ -252,6 +252,19 @@ def test_seals_at_the_same_time_leave_a_whole_store_in_any_order(
     assert_rows(stored(run.storage), expected(of(run, *run.planned())))
 
 
+def test_of_two_seals_of_the_same_rows_one_store_stays(tmp_path: Path) -> None:
+    """Two drivers end at once: the second is done while the first writes."""
+    run, others = make_run(tmp_path, 30), list[str]()
+
+    def tick(done: int, total: int) -> None:
+        if not others:
+            others.append(seal(Run.open(tmp_path).storage))
+
+    assert [seal(run.storage, tick)] == others
+    assert [f"{path}" for path in tmp_path.glob("*.zarr")] == others and found(tmp_path) == []
+    assert_rows(stored(run.storage), expected(of(run, *run.planned())))
+
+
 # Stores from elsewhere ------------------------------------------------------------------------
 
 
