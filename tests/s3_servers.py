@@ -57,7 +57,23 @@ def moto_server(log: Path) -> Generator[int]:
 
 def make_bucket(port: int, bucket: str) -> None:
     """Make a bucket on a server."""
-    request = urllib.request.Request(f"http://127.0.0.1:{port}/{bucket}", method="PUT")
+    _put(f"http://127.0.0.1:{port}/{bucket}")
+
+
+def make_locked_bucket(port: int, bucket: str) -> None:
+    """Make a bucket with object lock, whose objects cannot be removed for a day."""
+    address = f"http://127.0.0.1:{port}/{bucket}"
+    _put(address, **{"x-amz-bucket-object-lock-enabled": "true"})
+    rule = "<Rule><DefaultRetention><Mode>COMPLIANCE</Mode><Days>1</Days></DefaultRetention></Rule>"
+    _put(
+        f"{address}?object-lock",
+        f"<ObjectLockConfiguration><ObjectLockEnabled>Enabled</ObjectLockEnabled>{rule}</ObjectLockConfiguration>",
+    )
+
+
+def _put(address: str, body: str = "", **headers: str) -> None:
+    headers = {"Content-Type": "application/xml", **headers}
+    request = urllib.request.Request(address, body.encode() or None, headers, method="PUT")
     urllib.request.urlopen(request, timeout=120).close()
 
 
@@ -176,6 +192,8 @@ def faulty_proxy(upstream: int, faults: Faults) -> Generator[int]:
 
         def _forward(self, body: bytes) -> tuple[int, Mapping[str, str], bytes]:
             headers = {k: v for k, v in self.headers.items() if k.lower() not in _HOP}
+            if "x-amz-checksum-sha256" in self.headers:  # enough for S3, not for moto
+                headers["x-amz-sdk-checksum-algorithm"] = "SHA256"
             if faults.forgets_create_only:
                 headers = {k: v for k, v in headers.items() if k.lower() != "if-none-match"}
             if "if-none-match" in self.headers:
