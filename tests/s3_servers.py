@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import random
 import socket
 import subprocess
@@ -10,7 +11,7 @@ import threading
 import time
 import urllib.request
 from collections import Counter
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.client import HTTPConnection, HTTPException
@@ -28,6 +29,7 @@ services = tuple(backends.list_of_moto_modules())
 backends.list_of_moto_modules = lambda: services
 server.main(sys.argv[1:])
 """
+_PART_BYTES = 2**16
 _HOP = ("connection", "keep-alive", "transfer-encoding", "content-length", "date", "server")
 
 
@@ -100,6 +102,7 @@ class Faults:
     lost_creates: int = 0  # every so many-th create-only put, of commits and of others: done, answered 500
     hold_s: float = 0.0
     delay_s: float = 0.0  # before every request
+    bytes_per_s: float = float("inf")  # of each connection, both ways
     seed: int = 0
     down_after: list[int] = field(default_factory=list[int])  # counts of requests after which all fails
     down_at_commits: list[int] = field(default_factory=list[int])  # done, not answered, then all fails
@@ -167,7 +170,10 @@ def faulty_proxy(upstream: int, faults: Faults) -> Generator[int]:
         disable_nagle_algorithm = True
 
         def handle_any(self) -> None:
-            body = self.rfile.read(int(self.headers.get("content-length") or 0))
+            size = int(self.headers.get("content-length") or 0)
+            body = b"".join(self._slowly(size, self.rfile.read))
+            if len(body) < size:
+                return self._break_off()
             kind = faults.kind(self.path, "if-none-match" in self.headers)
             time.sleep(faults.delay_s)
             if kind in ("error", "down"):
@@ -228,7 +234,15 @@ def faulty_proxy(upstream: int, faults: Faults) -> Generator[int]:
             with suppress(OSError):  # whoever asked may have given up
                 self._head(status, headers, len(data))
                 if self.command != "HEAD":
-                    self.wfile.write(data)
+                    file = io.BytesIO(data)
+                    for _ in self._slowly(len(data), lambda size: self.wfile.write(file.read(size))):
+                        pass
+
+        def _slowly(self, size: int, move: Callable[[int], Any]) -> Iterator[Any]:
+            for at in range(0, size, _PART_BYTES):
+                part = min(_PART_BYTES, size - at)
+                time.sleep(part / faults.bytes_per_s)
+                yield move(part)
 
         def _break_off(self) -> None:
             self.close_connection = True

@@ -86,6 +86,14 @@ def test_answers_that_break_off_are_asked_for_again(behind: Behind):
             assert s.get_range("k/7", start, 500) == b"7" * 500
 
 
+def test_a_large_object_on_a_slow_line_is_not_silence(behind: Behind):
+    data = bytes(2_000_000)
+    with behind(Faults(bytes_per_s=600_000)) as s:
+        assert s.put_new("c/0", data)
+        s.put("a", data)
+        assert s.get("c/0", len(data)) == s.get("a", len(data)) == data
+
+
 def test_a_store_that_ignores_create_only_is_refused(behind: Behind, bucket: str):
     with behind(Faults(forgets_create_only=True)):
         with pytest.raises(InputError, match="does not support create-only writes") as e:
