@@ -151,17 +151,19 @@ def seal(storage: Storage, tick: Tick = lambda done, total: None, runs: Sequence
     name = _claimed_name(storage, old)
     try:
         files = tuple(_write(storage, name, contents, tick))
+        other = store_record(storage)
+        if other is not None and (other.rows_sha256, other.parts) == rows:
+            remove_store(storage, name)  # another driver that ended at the same time was faster
+            return f"{storage.url}/{other.name}"
+        new = StoreRecord(name=name, rows_sha256=rows[0], parts=rows[1], files=files)
+        storage.put(RECORD, encode_record(new))
     except BaseException:
         with suppress(InputError):
-            remove_store(storage, name)
-            storage.delete([f"{name}{CLAIM}"])  # no record named it, so no other process removes it
+            named = store_record(storage)  # written even where an error was reported, as of its folder
+            if named is None or named.name != name:
+                remove_store(storage, name)
+                storage.delete([f"{name}{CLAIM}"])  # no record named it, so no other process removes it
         raise
-    other = store_record(storage)
-    if other is not None and (other.rows_sha256, other.parts) == rows:
-        remove_store(storage, name)  # another driver that ended at the same time was faster
-        return f"{storage.url}/{other.name}"
-    new = StoreRecord(name=name, rows_sha256=rows[0], parts=rows[1], files=files)
-    storage.put(RECORD, encode_record(new))
     if old is not None:
         remove_store(storage, old.name)
     return f"{storage.url}/{name}"
