@@ -218,8 +218,8 @@ class RayExecutor(Generic[T]):
         except e.WorkerCrashedError:
             if killed:
                 return _Death(task, "cancelled", "killed")
-            why = "killed, as by the kernel for lack of memory, or crashed in native code"
-            return _Death(task, "crashed", f"the worker process died ({why})")
+            died = "the worker process died (killed, as by the kernel for lack of memory, or in native code)"
+            return _Death(task, "crashed", died)
         except e.RayError as error:  # node, raylet, owner or object lost: not the shard's fault
             return _Death(task, "lost", f"{type(error).__name__}: {first_line(error)}")
         if isinstance(report, str):  # the package, or the function, could not be loaded there
