@@ -75,8 +75,8 @@ slow: venv
 	@$(SCRATCH); $(TESTS) -m slow --basetemp=$$scratch/tests && rm -rf $$scratch
 
 # Each ends with an error where a promise was broken.
-FAULTS := crash_points damage kills executors two_drivers s3 confinement swaps storage_errors power_cut \
-	hostile_files hostile_meshes histories many_scenes many_commits
+FAULTS := crash_points damage kills executors two_drivers two_clusters s3 confinement swaps storage_errors \
+	power_cut disks hostile_files hostile_meshes histories many_scenes many_commits
 faults: venv
 	@set -e; for name in $(FAULTS); do echo; echo "== $$name"; $(BIN)/python -m benchmarks.faults.$$name; done
 	@echo; echo "== driver"; $(BIN)/python -m benchmarks.driver

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import random
 import socket
 import subprocess
@@ -10,7 +11,7 @@ import threading
 import time
 import urllib.request
 from collections import Counter
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.client import HTTPConnection, HTTPException
@@ -28,6 +29,7 @@ services = tuple(backends.list_of_moto_modules())
 backends.list_of_moto_modules = lambda: services
 server.main(sys.argv[1:])
 """
+_PART_BYTES = 2**16
 _HOP = ("connection", "keep-alive", "transfer-encoding", "content-length", "date", "server")
 
 
@@ -57,7 +59,23 @@ def moto_server(log: Path) -> Generator[int]:
 
 def make_bucket(port: int, bucket: str) -> None:
     """Make a bucket on a server."""
-    request = urllib.request.Request(f"http://127.0.0.1:{port}/{bucket}", method="PUT")
+    _put(f"http://127.0.0.1:{port}/{bucket}")
+
+
+def make_locked_bucket(port: int, bucket: str) -> None:
+    """Make a bucket with object lock, whose objects cannot be removed for a day."""
+    address = f"http://127.0.0.1:{port}/{bucket}"
+    _put(address, **{"x-amz-bucket-object-lock-enabled": "true"})
+    rule = "<Rule><DefaultRetention><Mode>COMPLIANCE</Mode><Days>1</Days></DefaultRetention></Rule>"
+    _put(
+        f"{address}?object-lock",
+        f"<ObjectLockConfiguration><ObjectLockEnabled>Enabled</ObjectLockEnabled>{rule}</ObjectLockConfiguration>",
+    )
+
+
+def _put(address: str, body: str = "", **headers: str) -> None:
+    headers = {"Content-Type": "application/xml", **headers}
+    request = urllib.request.Request(address, body.encode() or None, headers, method="PUT")
     urllib.request.urlopen(request, timeout=120).close()
 
 
@@ -84,6 +102,7 @@ class Faults:
     lost_creates: int = 0  # every so many-th create-only put, of commits and of others: done, answered 500
     hold_s: float = 0.0
     delay_s: float = 0.0  # before every request
+    bytes_per_s: float = float("inf")  # of each connection, both ways
     seed: int = 0
     down_after: list[int] = field(default_factory=list[int])  # counts of requests after which all fails
     down_at_commits: list[int] = field(default_factory=list[int])  # done, not answered, then all fails
@@ -151,7 +170,10 @@ def faulty_proxy(upstream: int, faults: Faults) -> Generator[int]:
         disable_nagle_algorithm = True
 
         def handle_any(self) -> None:
-            body = self.rfile.read(int(self.headers.get("content-length") or 0))
+            size = int(self.headers.get("content-length") or 0)
+            body = b"".join(self._slowly(size, self.rfile.read))
+            if len(body) < size:
+                return self._break_off()
             kind = faults.kind(self.path, "if-none-match" in self.headers)
             time.sleep(faults.delay_s)
             if kind in ("error", "down"):
@@ -176,6 +198,8 @@ def faulty_proxy(upstream: int, faults: Faults) -> Generator[int]:
 
         def _forward(self, body: bytes) -> tuple[int, Mapping[str, str], bytes]:
             headers = {k: v for k, v in self.headers.items() if k.lower() not in _HOP}
+            if "x-amz-checksum-sha256" in self.headers:  # enough for S3, not for moto
+                headers["x-amz-sdk-checksum-algorithm"] = "SHA256"
             if faults.forgets_create_only:
                 headers = {k: v for k, v in headers.items() if k.lower() != "if-none-match"}
             if "if-none-match" in self.headers:
@@ -210,7 +234,15 @@ def faulty_proxy(upstream: int, faults: Faults) -> Generator[int]:
             with suppress(OSError):  # whoever asked may have given up
                 self._head(status, headers, len(data))
                 if self.command != "HEAD":
-                    self.wfile.write(data)
+                    file = io.BytesIO(data)
+                    for _ in self._slowly(len(data), lambda size: self.wfile.write(file.read(size))):
+                        pass
+
+        def _slowly(self, size: int, move: Callable[[int], Any]) -> Iterator[Any]:
+            for at in range(0, size, _PART_BYTES):
+                part = min(_PART_BYTES, size - at)
+                time.sleep(part / faults.bytes_per_s)
+                yield move(part)
 
         def _break_off(self) -> None:
             self.close_connection = True

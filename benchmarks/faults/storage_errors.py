@@ -1,4 +1,4 @@
-"""One system call of a real program fails with EIO or ENOSPC, in attempts, seals, merges and repairs.
+"""One system call of a real program fails with EIO, ENOSPC or EDQUOT, in attempts, seals, merges and repairs.
 
     python -m benchmarks.faults.storage_errors [--sample 12] [--only seal]
 

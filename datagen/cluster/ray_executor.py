@@ -218,7 +218,8 @@ class RayExecutor(Generic[T]):
         except e.WorkerCrashedError:
             if killed:
                 return _Death(task, "cancelled", "killed")
-            return _Death(task, "crashed", "the worker process died (killed, or crashed in native code)")
+            died = "the worker process died (killed, as by the kernel for lack of memory, or in native code)"
+            return _Death(task, "crashed", died)
         except e.RayError as error:  # node, raylet, owner or object lost: not the shard's fault
             return _Death(task, "lost", f"{type(error).__name__}: {first_line(error)}")
         if isinstance(report, str):  # the package, or the function, could not be loaded there

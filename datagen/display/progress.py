@@ -47,11 +47,11 @@ class Pace:
             self._seen.popleft()
 
     def per_s(self, which: int = 0) -> float:
-        """Growth of one total per second; 0 while unknown."""
+        """Growth of one total per second; 0 while unknown, or where killed attempts have made it less."""
         then_s, before = self._seen[0]
         elapsed_s = self._clock() - then_s
         grown = self._totals[which] - (before[which] if before else 0) if self._totals else 0.0
-        return grown / elapsed_s if elapsed_s > 0 else 0.0
+        return max(0.0, grown / elapsed_s) if elapsed_s > 0 else 0.0
 
     def left_s(self, more: float, which: int = 0) -> float | None:
         """Seconds until one total has grown by `more`; None while its rate is unknown."""

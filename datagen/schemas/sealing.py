@@ -145,19 +145,25 @@ def seal(storage: Storage, tick: Tick = lambda done, total: None, runs: Sequence
     """
     contents = read_contents(runs or open_runs(storage))
     old = store_record(storage)
-    digest, parts = contents.digest(), contents.parts()
-    if old is not None and (old.rows_sha256, old.parts) == (digest, parts):
+    rows = contents.digest(), contents.parts()
+    if old is not None and (old.rows_sha256, old.parts) == rows:
         return f"{storage.url}/{old.name}"
     name = _claimed_name(storage, old)
     try:
         files = tuple(_write(storage, name, contents, tick))
+        other = store_record(storage)
+        if other is not None and (other.rows_sha256, other.parts) == rows:
+            remove_store(storage, name)  # another driver that ended at the same time was faster
+            return f"{storage.url}/{other.name}"
+        new = StoreRecord(name=name, rows_sha256=rows[0], parts=rows[1], files=files)
+        storage.put(RECORD, encode_record(new))
     except BaseException:
         with suppress(InputError):
-            remove_store(storage, name)
-            storage.delete([f"{name}{CLAIM}"])  # no record named it, so no other process removes it
+            named = store_record(storage)  # written even where an error was reported, as of its folder
+            if named is None or named.name != name:
+                remove_store(storage, name)
+                storage.delete([f"{name}{CLAIM}"])  # no record named it, so no other process removes it
         raise
-    new = StoreRecord(name=name, rows_sha256=digest, parts=parts, files=files)
-    storage.put(RECORD, encode_record(new))
     if old is not None:
         remove_store(storage, old.name)
     return f"{storage.url}/{name}"

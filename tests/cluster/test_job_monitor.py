@@ -14,6 +14,7 @@ import pytest
 from rich.console import Console
 
 from datagen.cluster.driver import drive
+from datagen.cluster.heartbeat import Running
 from datagen.cluster.job_monitor import JobMonitor, JobProgress, JobRecorder
 from datagen.cluster.protocol import AttemptReport, JobSummary, JobTotals, StopRequest
 from datagen.cluster.shard_policy import RetryPolicy
@@ -84,6 +85,21 @@ def test_state_is_published_every_ten_seconds_and_requests_are_read_every_three(
     assert last.labels_per_s == pytest.approx(4 * 10 / SHARD_S, rel=0.1)
     assert last.left_s is not None and last.left_s == pytest.approx((400 - done[-1]) * 10 / last.labels_per_s)
     assert last.stopping == ""
+
+
+def test_a_state_can_be_read_when_killed_attempts_had_labels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, jobs = FakeClock(), Jobs(open_storage(tmp_path))
+    recorder = JobRecorder(jobs, ("datagen",), "local", shards=4)
+    lost = "datagen.cluster.job_monitor.running_attempts"
+    monkeypatch.setattr(lost, lambda notes: Running(labels=100 if clock.now_s < 50 else 0))
+    with Progress(True, clock, Console(file=io.StringIO())) as shown:
+        monitor = JobMonitor(recorder, StopRequest(), shown, labels_per_shard=10)
+        for clock.now_s in range(80):
+            monitor.tick(JobTotals(4))
+    (job,) = jobs.all()
+    assert job.state is not None and job.state.labels_per_s == 0
 
 
 def test_a_request_drains_the_job_and_is_published_at_once(tmp_path: Path) -> None:

@@ -118,6 +118,8 @@ def test_the_rate_is_that_of_the_last_minute():
         total += 1 if second <= 200 else 5
         pace.see(total)
     assert pace.per_s() == 5.0 and pace.left_s(10) == 2.0
+    pace.see(0)  # attempts that ran were killed
+    assert pace.per_s() == 0 and pace.left_s(10) is None
 
 
 def test_clock_text():

@@ -51,13 +51,14 @@ def job(folder: str, noted: str, shards: int) -> None:
     """Make the run, or go on with it; `noted` has what must outlive a power cut from then on."""
     count(noted, "begun", "-")
     try:
-        _make(folder, noted, shards)
+        make_in_steps(folder, noted, shards)
     except InputError as error:  # the disk is gone
         is_gone = error.problem in ("Input/output error", "Read-only file system")
         sys.exit(2 if is_gone else f"error: {error}")
 
 
-def _make(folder: str, noted: str, shards: int) -> None:
+def make_in_steps(folder: str, noted: str, shards: int) -> None:
+    """Make the run in steps, each of which ends with a seal. InputError where the disk fails a record."""
     storage, per_step = open_storage(folder), SAMPLES_PER_SHARD * shards // _STEPS
     run = Run.create_or_open(storage, manifest_of(small_spec(), LAYOUT), per_step)
     jobs, name = Jobs(storage), new_job_id()
@@ -86,10 +87,10 @@ class Disk:
     folder: Path
 
     def mount(self) -> None:
-        _call("mount", "-o", "loop,noatime", str(self.image), str(self.folder))
+        call("mount", "-o", "loop,noatime", str(self.image), str(self.folder))
 
     def unmount(self) -> None:
-        _call("umount", str(self.folder))
+        call("umount", str(self.folder))
 
     def cut(self) -> None:
         """Stop the file system at once; what its journal has not on the disk is lost."""
@@ -101,13 +102,16 @@ class Disk:
 
 
 @contextmanager
-def mounted_disk(folder: Path) -> Generator[Disk]:
-    """A new disk below the folder. CalledProcessError or OSError where this machine has none for us."""
+def mounted_disk(folder: Path, make: tuple[str, ...] = ("mkfs.ext4", "-q", "-F")) -> Generator[Disk]:
+    """A new disk below the folder, formatted by `make`.
+
+    CalledProcessError or OSError where this machine has none for us.
+    """
     disk = Disk(folder / "image", folder / "disk")
     disk.folder.mkdir()
     with disk.image.open("wb") as f:
         f.truncate(512 * 2**20)
-    _call("mkfs.ext4", "-q", "-F", str(disk.image))
+    call(*make, str(disk.image))
     disk.mount()
     try:
         yield disk
@@ -115,7 +119,8 @@ def mounted_disk(folder: Path) -> Generator[Disk]:
         disk.unmount()
 
 
-def _call(*words: str) -> None:
+def call(*words: str) -> None:
+    """Run a program of the system. CalledProcessError where it fails."""
     subprocess.run(words, check=True, capture_output=True, text=True)
 
 

@@ -62,8 +62,8 @@ def campaign(address: str, shards: int, faults: Faults, folder: Path) -> Outcome
     faults.error = faults.lost_answer = faults.hold = faults.cut = 0.0
     faults.lost_creates, faults.down_after, faults.down_at_commits = 0, [], []
     begun = executions(counted).begun
-    _hold_to_ledger(run, begun)
-    _hold_to_an_undisturbed_run(run, shards, folder / "undisturbed")
+    check_ledger(run, begun)
+    check_undisturbed(run, shards, folder / "undisturbed")
     counts = Counter({kind: count for kind, count in seen.items() if kind not in _COUNTS})
     return Outcome(shards, jobs, len(begun), seen["requests"], counts)
 
@@ -81,7 +81,7 @@ def _job(address: str, shards: int, counted: str) -> Run:
     return run
 
 
-def _hold_to_ledger(run: Run, begun: set[str]) -> None:
+def check_ledger(run: Run, begun: set[str]) -> None:
     """Every execution is in the ledger once, with a commit or an end; every shard was committed once."""
     assert not run.quarantined() and not run.missing()
     commits = {commit.attempt: commit for commit in run.commits()}
@@ -93,7 +93,7 @@ def _hold_to_ledger(run: Run, begun: set[str]) -> None:
     assert all(is_guess(ends[attempt]) for attempt in ends.keys() & commits.keys())
 
 
-def _hold_to_an_undisturbed_run(run: Run, shards: int, folder: Path) -> None:
+def check_undisturbed(run: Run, shards: int, folder: Path) -> None:
     """Committed objects and the sealed store are, bit by bit, those of a local run that nothing befell."""
     other = make_run(folder, shards * LAYOUT.samples_per_shard, 2, 5)
     for ours, theirs in zip(run.commits(), other.commits(), strict=True):

@@ -114,7 +114,7 @@ def try_errors(operation: Operation, work: Path, sample: int, rng: np.random.Gen
         points = _points(log, folder)
         for k in sorted(rng.choice(len(points), min(sample, len(points)), replace=False)):
             call, number = points[k]
-            error = "EIO" if call in _READING or rng.integers(2) else "ENOSPC"
+            error = "EIO" if call in _READING else ("EIO", "ENOSPC", "EDQUOT")[rng.integers(3)]
             shutil.rmtree(folder)
             shutil.copytree(clean, folder)
             _try(operation, folder, work, f"{call}:error={error}:when={number}", whole, outcome)

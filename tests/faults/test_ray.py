@@ -96,7 +96,7 @@ FATES = {
     # Killed from within or without: where native code fails, its stack is there.
     "segfault": Fate(("segfault",), ["crashed", "committed"], "Fatal Python error: Segm", "misbehave"),
     "abort": Fate(("abort",), ["crashed", "committed"], "Fatal Python error: Aborted", "misbehave"),
-    "kill": Fate(("kill",), ["crashed", "committed"], DIED),
+    "kill": Fate(("kill",), ["crashed", "committed"], rf"{DIED} \(killed, as by .* lack of memory"),
     # Ends without a word, be its status good or bad.
     "silent exit": Fate(("silent_exit",), ["crashed", "committed"], DIED),
     "exit": Fate(("exit",), ["crashed", "committed"], DIED),

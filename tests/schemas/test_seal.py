@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import subprocess
 import threading
@@ -24,7 +25,7 @@ from datagen.schemas.run_records import Layout
 from datagen.schemas.sealing import seal, store_record
 from datagen.schemas.shard_reading import ZipFiles
 from datagen.schemas.specification import Source
-from datagen.schemas.storage import open_storage
+from datagen.schemas.storage import Storage, open_storage, storage_error
 from datagen.train.run_parts import open_parts
 from tests.made_runs import attempt, files_of, make_run, manifest_of, small_spec, write
 from tests.schemas.checked import (
@@ -249,6 +250,45 @@ def test_seals_at_the_same_time_leave_a_whole_store_in_any_order(
     stored(run.storage)  # whole
     assert {kind for kind, _ in found(folder_of(run))} <= {"stale", "account"}
     seal(run.storage)
+    assert_rows(stored(run.storage), expected(of(run, *run.planned())))
+
+
+@pytest.mark.parametrize("is_written", [False, True])
+def test_a_seal_whose_record_fails_leaves_a_store_only_if_it_is_named(
+    is_written: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, put = make_run(tmp_path, 10), Storage.put
+    seal(run.storage)
+    make_run(tmp_path, 20)
+
+    def full(self: Storage, key: str, data: bytes, durably: bool = True) -> None:
+        if key != "data.json" or is_written:
+            put(self, key, data, durably)
+        if key == "data.json":
+            raise storage_error(tmp_path / key, OSError(errno.EDQUOT, ""))
+
+    with monkeypatch.context() as patched, pytest.raises(InputError, match="Disk quota exceeded"):
+        patched.setattr(Storage, "put", full)
+        seal(run.storage)
+    record = store_record(run.storage)
+    assert record is not None and record.name == ("data-2.zarr" if is_written else "data.zarr")
+    assert_rows(stored(run.storage), expected(of(run, *range(1 + is_written))))
+    assert is_written or [path.name for path in tmp_path.glob("data*.zarr*")] == [
+        "data.zarr",
+        "data.zarr.claim",
+    ]
+
+
+def test_of_two_seals_of_the_same_rows_one_store_stays(tmp_path: Path) -> None:
+    """Two drivers end at once: the second is done while the first writes."""
+    run, others = make_run(tmp_path, 30), list[str]()
+
+    def tick(done: int, total: int) -> None:
+        if not others:
+            others.append(seal(Run.open(tmp_path).storage))
+
+    assert [seal(run.storage, tick)] == others
+    assert [f"{path}" for path in tmp_path.glob("*.zarr")] == others and found(tmp_path) == []
     assert_rows(stored(run.storage), expected(of(run, *run.planned())))
 
 

@@ -86,6 +86,14 @@ def test_answers_that_break_off_are_asked_for_again(behind: Behind):
             assert s.get_range("k/7", start, 500) == b"7" * 500
 
 
+def test_a_large_object_on_a_slow_line_is_not_silence(behind: Behind):
+    data = bytes(2_000_000)
+    with behind(Faults(bytes_per_s=600_000)) as s:
+        assert s.put_new("c/0", data)
+        s.put("a", data)
+        assert s.get("c/0", len(data)) == s.get("a", len(data)) == data
+
+
 def test_a_store_that_ignores_create_only_is_refused(behind: Behind, bucket: str):
     with behind(Faults(forgets_create_only=True)):
         with pytest.raises(InputError, match="does not support create-only writes") as e:
@@ -141,12 +149,13 @@ def answering(answer: bytes | None) -> Generator[int]:
         server.shutdown(socket.SHUT_RDWR)
 
 
-def answer(status: str, code: str) -> bytes:
-    body = f"<Error><Code>{code}</Code><Message>the key AKIAMADEUP is bad</Message></Error>".encode()
+def answer(status: str, code: str, message: str = "the key AKIAMADEUP is bad") -> bytes:
+    body = f"<Error><Code>{code}</Code><Message>{message}</Message></Error>".encode()
     return f"HTTP/1.1 {status}\r\nContent-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode() + body
 
 
-TROUBLE: tuple[tuple[bytes | tuple[str, str] | None, str], ...] = (
+_LOCKED = "Content-MD5 OR x-amz-checksum- HTTP header is required for Put Object requests with Object Lock"
+TROUBLE: tuple[tuple[bytes | tuple[str, ...] | None, str], ...] = (
     (("403 Forbidden", "AccessDenied"), "access denied (AccessDenied). Allow AWS_ACCESS_KEY_ID"),
     (("403 Forbidden", "InvalidAccessKeyId"), "access denied (InvalidAccessKeyId). Check AWS_ACC"),
     (("403 Forbidden", "SignatureDoesNotMatch"), "(SignatureDoesNotMatch). Check AWS_SECRET_ACC"),
@@ -157,6 +166,7 @@ TROUBLE: tuple[tuple[bytes | tuple[str, str] | None, str], ...] = (
     (("400 Bad Request", "AuthorizationHeaderMalformed"), "is in another region (Authorization"),
     (("507 Insufficient Storage", "XMinioStorageFull"), "the store is full (XMinioStorageFull). Free"),
     (("403 Forbidden", "Unheard"), "access denied (Unheard). Check AWS_ACCESS_KEY_ID"),
+    (("400 Bad Request", "InvalidRequest", _LOCKED), "(object lock). Set AWS_CHECKSUM_ALGORITHM=SHA256"),
     (("501 Not Implemented", "NotImplemented"), "the store refuses (501 NotImplemented)"),
     (("503 Slow Down", "SlowDown"), "the store responds 503 SlowDown. Wait until"),
     (b"SSH-2.0-OpenSSH\r\n\r\n", "is not that of an S3 store. Check that AWS_ENDPOINT_URL"),
@@ -168,7 +178,7 @@ TROUBLE: tuple[tuple[bytes | tuple[str, str] | None, str], ...] = (
 
 @pytest.mark.parametrize(("reply", "problem"), TROUBLE)
 def test_every_trouble_is_one_line_with_its_fix(
-    reply: bytes | tuple[str, str] | None, problem: str, monkeypatch: pytest.MonkeyPatch
+    reply: bytes | tuple[str, ...] | None, problem: str, monkeypatch: pytest.MonkeyPatch
 ):
     with answering(answer(*reply) if isinstance(reply, tuple) else reply) as port:
         for name, value in environment(port).items():

@@ -38,6 +38,7 @@ _RESUME = "then continue with `datagen resume`"
 _KEYS_FIX = "Check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, and what they allow in this bucket"
 _FULL_FIX = f"Free space in the store or raise its quota, {_RESUME}"
 _REGION_FIX = "Set AWS_REGION to the bucket's region, or AWS_ENDPOINT_URL to its store"
+_LOCK_FIX = "Set AWS_CHECKSUM_ALGORITHM=SHA256, or name a bucket without default retention"
 _NEW_KEYS = f"Set new AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_SESSION_TOKEN, {_RESUME}"
 _ALLOW = "Allow AWS_ACCESS_KEY_ID to get, put, delete and list in this bucket; see also its retention"
 # Codes of servers, problem and fix.
@@ -174,6 +175,8 @@ def store_trouble(error: Exception) -> RequestFailure:
     if known := _ADVICE.get(code):
         problem = known[0] if code == "NoSuchBucket" else f"{known[0]} ({code})"
         return RequestFailure(problem, known[1], is_transient=False)
+    if re.search("(?i)<Message>[^<]*Content-MD5", text):  # no store has a code of its own for it
+        return RequestFailure("the bucket requires checksums (object lock)", _LOCK_FIX, is_transient=False)
     if "Received redirect without LOCATION" in text or status in ("301", "307"):
         return RequestFailure("the bucket is in another region", _REGION_FIX, is_transient=False)
     if status in ("401", "403"):

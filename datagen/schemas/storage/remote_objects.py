@@ -103,6 +103,7 @@ def _refuse_endpoint() -> None:
 PATIENCE = 1.5  # timeouts for which a request is retried, at least once
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 3.0
 _TOLD_AFTER = 6  # tries, some seconds: short failures are no news
+_SLOW_LINE = 125_000  # bytes per second, on which objects can still be written
 _DELETED_AT_ONCE = 1000  # limit of S3 per request
 _FAILURES = (BaseError, OSError, ValueError)
 
@@ -116,13 +117,14 @@ class RemoteObjects:
         self.bucket, self.prefix = bucket_and_prefix(url)
         self.url = f"s3://{self.bucket}/{self.prefix}".rstrip("/")
         self._timeout_s = timeout_s()
-        self._store = self._open(self.prefix)
+        self._stores = dict[int, Any]()
+        self._store = self._sending(0)
 
     def below(self, key: str) -> RemoteObjects:
         return RemoteObjects(f"{self.url}/{key}")
 
     def put(self, key: str, data: bytes, durably: bool) -> None:
-        self._try(key, lambda: obstore.put(self._store, key, data, use_multipart=False))
+        self._try(key, lambda: obstore.put(self._sending(len(data)), key, data, use_multipart=False))
 
     def create(self, key: str, data: bytes) -> bool:
         """Write an object unless the name exists; False where it does.
@@ -132,7 +134,7 @@ class RemoteObjects:
 
         def put() -> bool:
             try:
-                obstore.put(self._store, key, data, mode="create", use_multipart=False)
+                obstore.put(self._sending(len(data)), key, data, mode="create", use_multipart=False)
             except AlreadyExistsError as e:
                 # Also the response while another request for this name is running, which may fail.
                 if "409 Conflict" in str(e) and not self.exists(key):
@@ -196,13 +198,20 @@ class RemoteObjects:
         while some := list(islice(left, _DELETED_AT_ONCE)):
             self._found(some[0], lambda some=some: obstore.delete(self._store, some))
 
-    def _open(self, prefix: str) -> Any:
+    def _sending(self, size: int) -> Any:
+        """The client for requests with N bytes: while it sends them, it takes the store for silent."""
+        timeouts = 1 << int(size / (_SLOW_LINE * self._timeout_s)).bit_length()
+        if timeouts not in self._stores:
+            self._stores[timeouts] = self._open(self.prefix, timeouts)
+        return self._stores[timeouts]
+
+    def _open(self, prefix: str, timeouts: int) -> Any:
         timeout = timedelta(seconds=self._timeout_s)
         options: Any = {
             **connection_settings(),
             "connect_timeout": min(timeout, timedelta(seconds=5)),
-            "read_timeout": timeout,
-            "timeout": 10 * timeout,  # for a whole object over a slow line
+            "read_timeout": timeouts * timeout,
+            "timeout": max(10, timeouts) * timeout,  # for a whole object over a slow line
         }
         retries: Any = {"max_retries": 0, "retry_timeout": timeout}
         try:
