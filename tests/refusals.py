@@ -24,7 +24,8 @@ def refused(arguments: list[str], capture: pytest.CaptureFixture[str], *words: s
 
 PHASES = {
     "opening houses and objects", "opening runs", "starting Ray", "checking the machines", "making labels",
-    "relabelling",
+    "relabelling", "compiling the planner for this machine, once: about 20 s",
+    "compiling kinematics for this machine, once: about 5 s",
 }  # fmt: skip
 
 

@@ -89,7 +89,8 @@ def evaluate(
     if closed_loop:
         _refuse_bad_loop(closed_loop, execute, workers, files)
     checkpoints, run_paths = split_paths([str(path) for path in paths])
-    runs, models = open_evaluated_runs(run_paths), open_models(checkpoints)
+    runs = open_evaluated_runs(run_paths)
+    models = open_models(checkpoints, runs)
     if not allow_seen_houses:
         refuse_seen_houses(runs, models)
     rule = None if heuristic is None else read_heuristic(Path(heuristic), runs, allow_seen_houses)

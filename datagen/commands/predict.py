@@ -15,7 +15,7 @@ from cyclopts import Parameter, Token
 
 from datagen.console.command_lines import options_of, prints
 from datagen.console.options import AsJson, File, refuse_output
-from datagen.console.printing import print_json, print_rows
+from datagen.console.printing import compiling_shown, print_json, print_rows
 from datagen.released import DEMO_BASE_HEIGHT_M, DEMO_CLICK, DEMO_REACH_M, sample_frame
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import whole_file
@@ -228,7 +228,8 @@ def predict(given: PredictOptions) -> Prediction:
 
 def _of_robot(given: PredictOptions, robot: str) -> tuple[PredictOptions, float]:
     """The options with a robot's sizes where they give none, and its heading to the target (rad)."""
-    limits = robot_limits(robot)
+    with compiling_shown(given.json):
+        limits = robot_limits(robot)
     (low, high), heights = limits.reach_m, limits.base_height_m
     sizes = {
         "reach": high if low == high else None,

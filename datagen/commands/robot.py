@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from datagen.console.options import refuse_output
-from datagen.console.printing import print_rows
+from datagen.console.printing import compiling_shown, print_rows
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.kinematics.tree import frame_poses
 from datagen.workers.robots import open_robot, robot_digest, robot_limits
@@ -35,8 +35,10 @@ def robot(robot: str, /, *, out: Path | None = None) -> int:
     if out is not None:
         refuse_output(out, "--out", ".png")
     began_s = time.monotonic()
-    limits = robot_limits(robot)
-    opened = open_robot(robot, limits.reach_m[1], (limits.base_height_m or (_PEDESTAL_M,))[0])
+    with compiling_shown():
+        limits = robot_limits(robot)
+        opened = open_robot(robot, limits.reach_m[1], (limits.base_height_m or (_PEDESTAL_M,))[0])
+        opened.ik(np.eye(4), opened.homes_rad[0])  # compiled on its first call, which is not measured
     took = f"{time.monotonic() - began_s:.1f} s"
     low, high = np.maximum(opened.q_lower_rad, -np.pi), np.minimum(opened.q_upper_rad, np.pi)
     q = np.random.default_rng(0).uniform(low, high, (10 * _POSES, len(low)))

@@ -16,7 +16,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from datagen.display.progress import Progress
 from datagen.schemas.errors import printable
+from datagen.workers.kinematics import on_compiling
 
 
 def print_json(value: Any) -> None:
@@ -53,6 +55,14 @@ def print_lines(text: str, indent: str = "") -> None:
 def drop_output() -> None:
     """Send further standard output nowhere. Without this, Python reports a second error when it exits."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextmanager
+def compiling_shown(as_json: bool = False) -> Generator[None]:
+    """Show a line of progress where opening a robot compiles, before it does."""
+    text = "compiling kinematics for this machine, once: about 5 s"
+    with Progress(as_json) as progress, on_compiling(lambda: progress.say("compiling", {"text": text}, text)):
+        yield
 
 
 @contextmanager

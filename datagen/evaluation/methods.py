@@ -25,6 +25,7 @@ from datagen.schemas.specification import HeuristicParams
 from datagen.train.baselines import BASELINES, fit_baselines, make_baselines
 from datagen.train.baselines.baseline import Calibration, calibrate
 from datagen.train.baselines.scalars import Scalars
+from datagen.train.headings import refuse_other_heading, side_deg_of, trained_side_deg
 from datagen.train.scorers import ModelScorer, Scorer, weights_sha256
 from datagen.train.splits import refuse_shared_houses
 from datagen.workers.extras import EXTRAS, how_to_get
@@ -208,8 +209,11 @@ def baseline_methods(
     )
 
 
-def open_models(paths: Sequence[str]) -> list[EvaluatedMethod]:
-    """The models of these checkpoints, named by their files; the released one has its own name."""
+def open_models(paths: Sequence[str], runs: Sequence[EvaluatedRun] = ()) -> list[EvaluatedMethod]:
+    """The models of these checkpoints, named by their files; the released one has its own name.
+
+    InputError where bases of `runs` stand to the target otherwise than those that one was trained on.
+    """
     if not paths:
         return []
     from datagen.train.training.checkpoints import load_model
@@ -217,6 +221,9 @@ def open_models(paths: Sequence[str]) -> list[EvaluatedMethod]:
     found: list[EvaluatedMethod] = []
     for path in paths:
         model, head = load_model(path)
+        for place, spec in ((run.place, spec) for run in runs for spec in run.specs):
+            other_deg = trained_side_deg(head)
+            refuse_other_heading(place, "candidates.yaw_rad", side_deg_of(spec), path, other_deg)
         name = RELEASED if path == str(released_checkpoint()) else Path(path).stem
         found.append(EvaluatedMethod(name, ModelScorer(model, name, only_clear=True), path, head))
     return found
@@ -232,7 +239,7 @@ def open_methods(
     kinds = {each: _kind(each) for each in named}
     checkpoints = [each for each, kind in kinds.items() if kind == "checkpoint"]
     paths = [str(released_checkpoint()) if each == RELEASED else each for each in checkpoints]
-    found = dict(zip(checkpoints, open_models(paths), strict=True))
+    found = dict(zip(checkpoints, open_models(paths, runs), strict=True))
     if baselines := [each for each, kind in kinds.items() if kind == "baseline"]:
         made = baseline_methods(baselines, fit, runs, json=json)
         found |= dict(zip(baselines, made.baselines, strict=True))

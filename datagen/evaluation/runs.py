@@ -14,7 +14,8 @@ from datagen.schemas.run import open_runs
 from datagen.schemas.specification import Specification
 from datagen.train.baselines import FIELDS
 from datagen.train.dataset import SampleStream
-from datagen.train.run_parts import refuse_mixed_labels, refuse_sampled_yaw
+from datagen.train.headings import refuse_sampled_yaw
+from datagen.train.run_parts import refuse_mixed_labels
 from datagen.workers.bases.candidate_sets import CANDIDATE_SETS
 
 # Whole scenes: a model scores a few scenes of 625 candidates at once.

@@ -7,7 +7,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
@@ -38,6 +38,7 @@ from datagen.console.options import JSON_HELP, RUNNING, Whole, option
 from datagen.console.printing import counted
 from datagen.display.progress import Progress
 from datagen.jobs.job_report import JobResult
+from datagen.reports.agreement import doubt, read_labels
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobEnd, Jobs
 from datagen.schemas.run import Run, RunReplaced
@@ -212,6 +213,8 @@ class Job:
                 probe=probe,
             )
 
+        if spec.arm is not None and self.options.address == "local":
+            _tell_compiling(shown)
         shown.phase("making labels")
         done = len(run.planned()) - len(shards)
         events = JobMonitor(recorder, stop, shown, layout.samples_per_shard, done, notes, run.refuse_replaced)
@@ -276,6 +279,7 @@ class Job:
             retries=totals.retries,
             start_s=summary.start_s,
             elapsed_s=summary.elapsed_s,
+            doubt="" if summary.end == "interrupted" or totals.positives else _doubt(runs),
             store="" if summary.end == "interrupted" or self.options.no_seal else self._seal(runs),
             cause=summary.cause or (causes.most_common(1)[0][0] if causes else ""),
             resume=tuple(self.resume),
@@ -285,6 +289,26 @@ class Job:
         shards = sum(len(run.committed()) for run in runs)
         with self.options.display() as shown:
             return seal(self.storage, shown.counter("shards sealed"), runs) if shards else ""
+
+
+def _doubt(runs: Sequence[Run]) -> str:
+    """That of the first run that has one; a damaged shard is reported by readers, not here."""
+    for run in runs:
+        if run.manifest.spec.arm is not None and not any(commit.positives for commit in run.commits()):
+            with suppress(InputError):
+                if line := doubt(read_labels(run)):
+                    return line
+    return ""
+
+
+def _tell_compiling(shown: Progress) -> None:
+    # Imported here: labels without an arm need no compiler.
+    from datagen.workers.kinematics.compiler import is_kept
+    from datagen.workers.motion.search import try_pose
+
+    # Not the folder: opening the robot has compiled a part.
+    if not is_kept(try_pose):
+        _tell(shown, "compiling", "compiling the planner for this machine, once: about 20 s")
 
 
 def _tell(shown: Progress, event: str, line: str) -> None:

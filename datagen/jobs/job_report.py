@@ -42,6 +42,7 @@ class JobResult:
     elapsed_s: float = 0.0  # from then on
     store: str = ""  # the sealed store, which zarr and xarray open
     scenes: int = 0  # that a dry run would make
+    doubt: str = ""  # asks about the robot where no label of the run is positive
     cause: str = ""  # the most frequent one of a failed job
     resume: tuple[str, ...] = ()  # words of the command that continues, was detached, or a dry run would run
     follow: tuple[
@@ -156,6 +157,7 @@ def _print(result: JobResult) -> None:
     if result.store:
         rows.append(("store", f"{result.store}: zarr.open or xarray.open_zarr reads it"))
     print_rows(f"{result.end}: {path}", rows)
+    print_lines(result.doubt)
 
 
 def _time(result: JobResult) -> str:

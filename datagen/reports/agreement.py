@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from datagen.console.command_lines import command_line
 from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.run import MOST_SAMPLES, Run
 from datagen.schemas.shard_reading import read_committed
@@ -20,6 +21,7 @@ from datagen.workers.bases.candidate_sets import Bools, in_set, within_reach
 # In ascending fidelity: the later of two is the reference for the earlier.
 _FIDELITY = ("heuristic", "plan", "sim")
 _RESAMPLES = 1000
+_FEW, _CAUSES = 50, 3
 _COLUMNS = (
     *("sample_scene_index", "candidate_index", "label", "base_is_clear", "mount_distance_m", "arm_reach_m"),
 )
@@ -68,6 +70,20 @@ def read_labels(run: Run) -> Labels:
         within_reach=in_set("in-range", joined("base_is_clear") == 1, near),
         outcome=joined("outcome") if has_outcome else None,
     )
+
+
+def doubt(labels: Labels) -> str:
+    """A question about the robot where none of at least 50 labels of a run of plans is positive; else ""."""
+    n, manifest = len(labels.label), labels.run.manifest
+    if labels.outcome is None or manifest.spec.arm is None or n < _FEW or labels.label.any():
+        return ""
+    counts = np.bincount(labels.outcome, minlength=len(OUTCOMES))
+    most = [k for k in np.argsort(-counts, kind="stable")[:_CAUSES].tolist() if counts[k]]
+    causes = ", ".join(f"{tuple(OUTCOMES)[k]} {counts[k]:,}" for k in most)
+    robot = manifest.sources.get("robot") or manifest.spec.arm.robot
+    see = command_line(["robot", robot])
+    told = f"none of {n:,} labels is positive ({causes}): is robot {robot} right?"
+    return f"{labels.run.storage.url}: {told} See: {see}"
 
 
 def fidelity(spec: Specification) -> tuple[int, bool]:

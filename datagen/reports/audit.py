@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from math import fsum
 from typing import Any
 
-from datagen.reports.agreement import Labels, agreements, fidelity, read_labels
+from datagen.reports.agreement import Labels, agreements, doubt, fidelity, read_labels
 from datagen.reports.spending import Account, Spending, account_for
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import STAGES
@@ -69,6 +69,7 @@ def _source(
         "label_source": source,
         "made_from": "; ".join(dict.fromkeys(each.run.manifest.made_from for each in labels)),
         "counts": counts,
+        "doubts": [line for each in labels if (line := doubt(each))],
         "outcomes_within_reach": _summed(each.outcomes() for each in labels),
         "core_s": cost,
         "total_core_s": total,

@@ -40,6 +40,7 @@ def print_audit(report: Mapping[str, Any], full: bool = False) -> None:
         for source in sources
         if not source["includes_scenes"]
     ]
+    notes += [line for source in sources for line in source["doubts"]]
     notes += [f"{cause} ({_attempts(account)})" for cause, account in _costliest(sources)]
     notes += [_agreement(pair) for pair in report["agreement"] if pair["candidates"]]
     print_lines("\n".join(notes))

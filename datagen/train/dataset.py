@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, NotRequired
 
 import numpy as np
 from pydantic import Field
@@ -26,6 +26,7 @@ from datagen.train.batching import (
     stored_scenes,
     stored_view,
 )
+from datagen.train.headings import is_other_side, side_deg_of
 from datagen.train.inputs import I64, Array, Batch
 from datagen.train.reader import JOIN_FIELDS, load_shard
 from datagen.train.run_parts import open_parts
@@ -92,7 +93,9 @@ class DataOrigin(TypedDict):
 
     `samples_sha256` is over the ids and labels of the selected samples, in stored order: the same for a run,
     its copy and its sealed store. `cost` has the wall and CPU seconds of the whole run; None for a sealed
-    store without its run. `robots` has the least and the largest value of `ROBOT_SIZES` in metres.
+    store without its run. `robots` has the least and the largest value of `ROBOT_SIZES` in metres. `presents`
+    is how their bases stand to the target, `faces` or `side`; those that turn in place face it at first.
+    `side_deg` is the angle of the target from their front. Older checkpoints lack both.
     """
 
     spec_hashes: list[str]
@@ -103,6 +106,8 @@ class DataOrigin(TypedDict):
     samples_sha256: str
     cost: dict[str, float] | None
     robots: dict[str, Annotated[list[float], Field(min_length=2, max_length=2)]]
+    presents: NotRequired[Literal["faces", "side"]]
+    side_deg: NotRequired[Annotated[float, Field(ge=-180, le=180)]]
 
 
 # Fields of a specification's candidates, in which the robots of a run differ.
@@ -221,6 +226,8 @@ class SampleStream:
                 "samples_sha256": summary.samples_sha256,
                 "cost": None if summary.part.cost is None else dict(summary.part.cost),
                 "robots": robot_sizes(summary.part.specs),
+                "presents": "side" if is_other_side(side_deg_of(summary.part.specs[0]), 0.0) else "faces",
+                "side_deg": side_deg_of(summary.part.specs[0]),
             }
             for summary in self.parts
         ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -176,14 +176,6 @@ def open_sealed(path: Path | str, names: Sequence[str]) -> RunPart:
     ]
     sources = tuple({} for _ in specs)
     return RunPart(str(path), spec_hashes, specs, schema, version, slices, arrays, None, sources, attributes)
-
-
-def refuse_sampled_yaw(parts: Iterable[tuple[str, Specification]]) -> None:
-    """Raise InputError where a run, (path, specification), samples headings: no model has one as an input."""
-    for place, spec in parts:
-        if spec.candidates.samples_yaw:
-            problem = "headings of the base are sampled, and no model has them as an input yet"
-            raise InputError(place, "candidates.yaw_rad", problem, "Use runs with one heading to the target")
 
 
 def refuse_mixed_labels(parts: Sequence[tuple[str, Specification]]) -> None:

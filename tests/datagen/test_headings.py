@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.shard_reading import read_scene
+from datagen.train.headings import trained_side_deg
+from datagen.train.training.checkpoints import read_checkpoint
 from datagen.workers.bases.clearance import Footprint, base_clearance_m
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.labels.arm_labelling import arm_in_scene
@@ -25,6 +28,10 @@ from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstru
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG, HERE, PER_SCENE, arrays_of, make_small_run
+from tests.train.prediction.checkpoints import document_of, stored_with, write_untrained
+from tests.train.prediction.seen_scenes import MODEL
+from tests.train.prediction.test_trained_robots import SIZES, origin
+from tests.train.training.small import TINY
 
 OUTLINE = [[0.3, 0.2], [-0.25, 0.2], [-0.25, -0.2], [0.3, -0.2]]
 SAMPLED = CONFIG + "[candidates]\nyaw_rad = {low = -0.5, high = 1.0}\n"
@@ -51,6 +58,39 @@ def test_sampled_headings_are_stored_and_no_model_trains_on_them(
     for trained, validated in ((run, tmp_path / "plain"), (tmp_path / "plain", run)):
         line = ["train", "stage1", str(trained), "--val", str(validated)]
         refused([*line, "--out", str(tmp_path / "a.ckpt")], capsys, str(run), *words)
+
+
+def test_a_checkpoint_records_how_bases_stood_and_runs_that_differ_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    aside = CONFIG + "[candidates]\nyaw_rad = {low = 1.5707963, high = 1.5707963}\n"
+    ahead = make_small_run(tmp_path / "ahead", 12 * PER_SCENE)
+    right = make_small_run(tmp_path / "right", 12 * PER_SCENE, "--seed", "1", config=aside)
+    (tmp_path / "tiny.toml").write_text("".join(f"{name} = {value}\n" for name, value in TINY.items()))
+    more = [
+        "--epochs",
+        "1",
+        "--device",
+        "cpu",
+        "--threads",
+        "1",
+        "--model-config",
+        str(tmp_path / "tiny.toml"),
+    ]
+    words = ("candidates.yaw_rad", str(ahead), "face the target", "have the target -90 deg from their front")
+    for runs in ([ahead, right], [right, ahead], [ahead, "--val", right], [right, "--val", ahead]):
+        line = ["train", "stage1", *map(str, runs), "--out", str(tmp_path / "no.ckpt"), *more]
+        refused(line, capsys, str(right), *words)
+    for run, recorded in ((ahead, ("faces", 0.0)), (right, ("side", -90.0))):
+        file = tmp_path / f"{run.name}.ckpt"
+        assert cli.run(["train", "stage1", str(run), "--out", str(file), *more]) == 0
+        head = read_checkpoint(file).head
+        assert [(origin.get("presents"), round(origin.get("side_deg", 1.0), 3)) for origin in head.data] == [
+            recorded
+        ]
+        assert trained_side_deg(head) == pytest.approx(recorded[1], abs=0.001)
+        older = [{k: v for k, v in o.items() if k not in ("presents", "side_deg")} for o in head.data]
+        assert trained_side_deg(replace(head, data=tuple(older))) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -171,6 +211,24 @@ def test_candidates_of_such_a_robot_are_drawn_where_its_hand_gets(
         (tmp_path / "run.toml").write_text(f"[candidates]\nper_scene = 4\n{key}{text}\n")
         line[1] = source
         refused([*line, str(tmp_path / "run.toml"), "--robot", robot], capsys, *words)
+
+
+@needs_sim
+def test_a_model_of_bases_that_face_the_target_is_refused_for_others(
+    sideways: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, run = sideways
+    write_untrained(tmp_path / "model.ckpt", MODEL)  # as older checkpoints, without a record
+    words = (str(run), "candidates.yaw_rad", "-90 deg", "model.ckpt was trained on face the target")
+    refused(["evaluate", str(tmp_path / "model.ckpt"), str(run)], capsys, *words)
+    document = document_of(tmp_path / "model.ckpt")
+    document["head"]["data"] = [origin(robots=SIZES, presents="side", side_deg=-90.0)]
+    stored_with(tmp_path / "right.ckpt", tmp_path / "model.ckpt", head=document["head"])
+    assert cli.run(["evaluate", str(tmp_path / "right.ckpt"), str(run), "--baselines", "proximity"]) == 0
+    for value in (181.0, "left", None):
+        document["head"]["data"] = [origin(robots=SIZES, side_deg=value)]
+        stored_with(tmp_path / "bad.ckpt", tmp_path / "model.ckpt", head=document["head"])
+        refused(["evaluate", str(tmp_path / "bad.ckpt"), str(run)], capsys, "bad.ckpt", "side_deg")
 
 
 @needs_sim

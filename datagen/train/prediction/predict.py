@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from datagen.released import RELEASED, released_checkpoint
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import CandidateParams, ObservationParams
 from datagen.train.arrivals import Arrival
+from datagen.train.headings import refuse_other_heading, trained_side_deg
 from datagen.train.inputs import F64, I64, Array, Batch, CandidateInputs, Clouds, RobotInputs
 from datagen.train.prediction.base_cells import (
     BLOCKED,
@@ -174,7 +176,8 @@ def load_scorer(checkpoint: str | Path | None = None) -> ModelScorer:
 
     which = "the released model, " if checkpoint is None or checkpoint == RELEASED else ""
     model, head = load_model(released_checkpoint() if which else str(checkpoint))
-    return ModelScorer(model, f"{which}{head.model} ({head.stage})", robots=trained_robots(head))
+    name, side_deg = f"{which}{head.model} ({head.stage})", trained_side_deg(head)
+    return ModelScorer(model, name, robots=trained_robots(head), side_deg=side_deg)
 
 
 def predict(
@@ -200,6 +203,9 @@ def predict(
     `target_center_m` (3,), world, replaces the estimated centre. With an `arrival` error the best is the cell
     with the highest expected success. InputError where arguments are missing or invalid.
     """
+    if isinstance(scorer, ModelScorer):
+        side_deg = 0.0 - math.degrees(robot.yaw_rad)
+        refuse_other_heading("datagen predict", "--robot", side_deg, scorer.name, scorer.side_deg)
     grounds = _grounds(frames, camera_height_m, gravity)
     frames = _with_target(frames, grounds, click)
     prepared, filled = _fill(frames)

@@ -24,6 +24,7 @@ from numba.experimental import structref
 
 from datagen.schemas.safe_files import whole_file
 from datagen.workers.content_cache import cache_folder, drop_unused, refresh
+from datagen.workers.kinematics import tell_of_compiling
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _Tuple = TypeVar("_Tuple", bound=NamedTuple)
@@ -33,8 +34,17 @@ _MOST_FILES = 1024  # of all versions; one has about 100
 def compiled(function: _Function) -> _Function:
     """The function as machine code. Without fast-math: equal arguments give equal bits on one platform."""
     dispatcher: Any = numba.njit(error_model="numpy")(function)
-    dispatcher._cache = _MachineCode(f"{function.__module__}.{function.__qualname__}")
+    dispatcher._cache = _MachineCode(_name_of(function))
     return cast("_Function", dispatcher)
+
+
+def _name_of(function: Callable[..., Any]) -> str:
+    return f"{function.__module__}.{function.__qualname__}"
+
+
+def is_kept(function: Callable[..., Any]) -> bool:
+    """Whether machine code of a compiled function, for any types of arguments, is on this machine."""
+    return any(code_folder().glob(f"{_name_of(function)}-*.code"))
 
 
 def constant(value: int) -> int:
@@ -103,8 +113,9 @@ class _MachineCode(NullCache):
                 is_own = os.fstat(file.fileno()).st_uid == os.geteuid()
                 digest, data = file.read(32), file.read()
         except OSError:
-            return None
+            is_own, digest, data = False, b"", b""
         if not is_own or digest != sha256(data).digest():
+            tell_of_compiling()
             return None
         refresh(path)
         return CompileResult._rebuild(target_context, *pickle.loads(data))  # noqa: S301  our own file
@@ -121,4 +132,4 @@ class _MachineCode(NullCache):
 
     def _path(self, sig: Any, target_context: Any) -> Path:
         key = f"{self._name} {sig} {target_context.codegen().magic_tuple()}"
-        return code_folder() / f"{sha256(key.encode()).hexdigest()}.code"
+        return code_folder() / f"{self._name}-{sha256(key.encode()).hexdigest()[:32]}.code"

@@ -22,7 +22,7 @@ from datagen.schemas.safe_files import read_regular
 from datagen.workers.extras import how_to_get
 from datagen.workers.geometry.mesh import F32, F64, I32
 from datagen.workers.robots.gripper import Parts
-from datagen.workers.robots.urdf import Shape
+from datagen.workers.robots.urdf import MOST, Shape
 
 # PhysX on a GPU accepts hulls of at most 64 corners, and coal is faster on fewer.
 MAX_CORNERS = 64
@@ -32,7 +32,7 @@ _BOX_BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
 _TAKEN_AT_ONCE = 4
 _PUSHES = 50
 _TOUCHING_M = 1e-6
-_MOST_FACES, _SHEET_M = 500_000, 0.0005
+_MOST_FACES, _SHEET_M, _FLAT_M = 500_000, 0.0005, 5e-7
 _RING = np.stack([f(2 * np.pi * (np.arange(16) + 0.5) / 16) for f in (np.cos, np.sin)], axis=1)
 # Faces, edges and corners of a cube.
 _DIRECTIONS = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -47,7 +47,7 @@ def shape_parts(shape: Shape, scale: float, cuts_m: tuple[float, ...] = ()) -> P
 
     Boxes are exact; cylinders and spheres lie within prisms that touch them. A mesh gives one hull, or one
     for each slab between the heights `cuts_m` along its z axis. Raises InputError naming the mesh that is
-    missing or broken.
+    missing or broken, and a shape that is flat in single precision.
     """
     if shape.size_m is not None:
         hulls = (_solid(shape.size_m),)
@@ -55,7 +55,23 @@ def shape_parts(shape: Shape, scale: float, cuts_m: tuple[float, ...] = ()) -> P
         assert shape.mesh is not None
         hulls = tuple(hull * shape.scale for hull in mesh_hulls(shape.mesh, cuts_m))
     T = shape.T_link_shape
-    return tuple(((hull @ T[:3, :3].T + T[:3, 3]) * scale).astype(np.float32) for hull in hulls)
+    parts = tuple(((hull @ T[:3, :3].T + T[:3, 3]) * scale).astype(np.float32) for hull in hulls)
+    if any(map(_is_flat, parts)):
+        fix = "Correct it, or leave its link out with arm.ignore"
+        raise InputError(shape.path, shape.where, "has no volume", fix)
+    return parts
+
+
+def _is_flat(part: F32) -> bool:
+    """Whether a part (V, 3) is so thin that it has no hull, or none after it is moved in single precision."""
+    points = part.astype(np.float64) - part.mean(axis=0)
+    if np.ptp(points @ np.linalg.svd(points, full_matrices=False)[2][2]) < _FLAT_M:
+        return True
+    try:
+        ConvexHull(part)
+    except (QhullError, ValueError):
+        return True
+    return False
 
 
 def _solid(size_m: F64) -> F64:
@@ -107,8 +123,8 @@ def read_points(path: Path) -> tuple[F64, npt.NDArray[np.int64]]:
     if len(edges) > 3 * _MOST_FACES:
         fix = f"Simplify it to {_MOST_FACES:,} faces, or leave its link out with arm.ignore"
         raise InputError(path, "", f"has {len(edges) // 3:,} faces", fix)
-    if len(points) < 4 or not np.isfinite(points).all():
-        raise _wrong(path, "has fewer than four corners, or one that is not finite")
+    if len(points) < 4 or not (np.abs(points) <= MOST).all():
+        raise _wrong(path, f"has fewer than four corners, or one that is not within {MOST:,.0f} m")
     return points, edges
 
 

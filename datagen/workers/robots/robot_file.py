@@ -22,6 +22,7 @@ _MAX_BYTES = 1 << 20
 _FIX = "docs/guides/your-own-robot.md lists all keys"
 
 Name = Annotated[str, Field(min_length=1, max_length=200)]
+FileName = Annotated[str, Field(max_length=1000)]
 Length = Annotated[float, Field(ge=-20.0, le=20.0, allow_inf_nan=False)]
 Angle = Annotated[float, Field(ge=-100.0, le=100.0, allow_inf_nan=False)]
 Gain = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
@@ -82,7 +83,7 @@ class HandKeys(_Section):
     """The gripper."""
 
     name: str = ""
-    urdf: str | None = None  # of its own, where the arm's does not hold it
+    urdf: FileName | None = None  # of its own, where the arm's does not hold it
     palm: Name | None = None  # the arm's tip, where it is not given
     mount: PoseKeys | None = None  # the palm in the frame of the arm's tip
     fingers: tuple[Name, ...] = ()  # joints that open it: all that move below the palm, if none is given
@@ -154,7 +155,7 @@ class RobotFile(_Section):
 
     name: Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[A-Za-z0-9][A-Za-z0-9._ -]*$")] = ""
     about: str = ""
-    urdf: str  # path from this file's folder, or package:NAME/path
+    urdf: FileName  # path from this file's folder, or package:NAME/path
     reach_m: Annotated[float, Field(gt=0, le=20)] | None = None
     arm: ArmKeys
     hand: HandKeys = HandKeys()

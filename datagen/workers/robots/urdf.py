@@ -15,7 +15,8 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.robots.resources import mesh_path
 
 _MAX_BYTES = 8 << 20
-_MAX_LINKS = 1000
+_MAX_LINKS, _LONGEST, _LONGEST_PATH = 1000, 200, 1000
+MOST = 1e6  # of a number, whose squares and products stay finite
 FIX = "Correct the file, or install its package again"
 _MOVING = ("revolute", "continuous", "prismatic")
 _KINDS = (*_MOVING, "fixed", "planar", "floating")
@@ -39,6 +40,8 @@ class Shape:
     size_m: F64 | None
     mesh: Path | None
     scale: F64  # (3,) of the mesh
+    path: Path  # of the URDF, and the shape in it
+    where: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +85,7 @@ class UrdfTree:
     def joint(self, name: str) -> Joint:
         """The joint of that name. Raises InputError naming the file where it is missing."""
         if name not in self.joints:
-            raise _wrong(self.path, f"joint {name}", "is missing")
+            raise _wrong(self.path, f"joint {name:.80}", "is missing")
         return self.joints[name]
 
     def link(self, name: str) -> Link:
@@ -124,6 +127,8 @@ class UrdfTree:
             if name in seen:
                 raise _wrong(self.path, f"joint {name}", "mimics itself")
             seen.add(name)
+        if max(abs(ratio), abs(offset)) > MOST:
+            raise _wrong(self.path, f"joint {joint.name}", f"is mimicked {ratio:.3g} times plus {offset:.3g}")
         return joint, ratio, offset
 
     def limits(self, joint: Joint) -> tuple[float, float]:
@@ -146,7 +151,7 @@ def read_urdf(path: Path) -> UrdfTree:
     """All links and joints of a URDF; paths of meshes are resolved against its folder.
 
     Raises InputError naming the file and the element: unreadable, not XML, a number that is not
-    finite, a joint between links that do not exist, two parents of one link, a loop.
+    finite or too large, a joint between links that do not exist, two parents of one link, a loop.
     """
     data = read_regular(path, _MAX_BYTES, FIX)
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
@@ -159,7 +164,7 @@ def read_urdf(path: Path) -> UrdfTree:
         command = f"xacro {path.name} > {path.name.split('.')[0]}-expanded.urdf"
         raise InputError(path, "", "is a xacro file", f"Expand it, and name the result: {command}")
     if root.tag != "robot":
-        raise _wrong(path, root.tag, "is not <robot>")
+        raise _wrong(path, root.tag[:80], "is not <robot>")
     if max(len(root.findall("link")), len(root.findall("joint"))) > _MAX_LINKS:
         raise _wrong(path, "", f"has more than {_MAX_LINKS:,} links or joints")
     reader = _Reader(path)
@@ -168,7 +173,7 @@ def read_urdf(path: Path) -> UrdfTree:
     for joint in joints.values():
         for end in (joint.parent, joint.child):
             if end not in links:
-                raise _wrong(path, f"joint {joint.name}", f"link {end!r} does not exist")
+                raise _wrong(path, f"joint {joint.name}", f"link {end!r:.80} does not exist")
     if len({joint.child for joint in joints.values()}) < len(joints):
         raise _wrong(path, "joints", "a link has two parents")
     tree = UrdfTree(path, links, joints)
@@ -194,18 +199,28 @@ class _Reader:
         name = element.get("name", "")
         if not name:
             raise _wrong(self.path, element.tag, "has no name")
+        if len(name) > _LONGEST:
+            raise _wrong(self.path, f"{element.tag} {name[:40]}", f"has a name of {len(name):,} characters")
         return name
 
     def numbers(
-        self, element: ElementTree.Element | None, key: str, count: int, where: str, default: str
+        self,
+        element: ElementTree.Element | None,
+        key: str,
+        count: int,
+        where: str,
+        default: str,
+        most: float = MOST,
     ) -> F64:
         text = default if element is None else element.get(key, default)
         try:
             values = np.array([float(word) for word in text.split()])
         except ValueError:
-            raise _wrong(self.path, where, f"{key}={text!r} is not {count} numbers") from None
+            raise _wrong(self.path, where, f"{key}={text!r:.80} is not {count} numbers") from None
         if len(values) != count or not np.isfinite(values).all():
-            raise _wrong(self.path, where, f"{key}={text!r} is not {count} finite numbers")
+            raise _wrong(self.path, where, f"{key}={text!r:.80} is not {count} finite numbers")
+        if np.abs(values).max() > most:
+            raise _wrong(self.path, where, f"{key}={text!r:.80} is beyond {most:,.0f}")
         return values
 
     def origin(self, element: ElementTree.Element, where: str) -> F64:
@@ -245,19 +260,23 @@ class _Reader:
                 size_m = np.concatenate([self.numbers(solid, key, n, where, "") for key, n in keys])
                 if not (size_m > 0).all():
                     raise _wrong(self.path, where, f"its {kind} has no volume")
-                return Shape(T, size_m, None, np.ones(3))
+                return Shape(T, size_m, None, np.ones(3), self.path, where)
         mesh = element.find("geometry/mesh")
         if mesh is None:
             raise _wrong(self.path, where, f"has no {', '.join(_SIZES)} or mesh")
-        file = mesh_path(mesh.get("filename", ""), self.path)
-        return Shape(T, None, file, self.numbers(mesh, "scale", 3, where, "1 1 1"))
+        text = mesh.get("filename", "")
+        if len(text) > _LONGEST_PATH:
+            raise _wrong(self.path, where, f"its mesh has a path of {len(text):,} characters")
+        file = mesh_path(text, self.path)
+        scale = self.numbers(mesh, "scale", 3, where, "1 1 1")
+        return Shape(T, None, file, scale, self.path, where)
 
     def joint(self, element: ElementTree.Element) -> Joint:
         name = self.name(element)
         where = f"joint {name}"
         kind = element.get("type", "")
         if kind not in _KINDS:
-            raise _wrong(self.path, where, f"type {kind!r} is not one of {', '.join(_KINDS)}")
+            raise _wrong(self.path, where, f"type {kind!r:.80} is not one of {', '.join(_KINDS)}")
         parent, child = element.find("parent"), element.find("child")
         if parent is None or child is None:
             raise _wrong(self.path, where, "has no parent or no child")
@@ -270,11 +289,15 @@ class _Reader:
             axis = axis / np.linalg.norm(axis)
             limit = element.find("limit")
             if limit is not None:
-                speed = float(self.numbers(limit, "velocity", 1, where, "0")[0])
-                effort = float(self.numbers(limit, "effort", 1, where, "0")[0])
+                speed, effort = (
+                    float(self.numbers(limit, key, 1, where, "0", math.inf)[0])
+                    for key in ("velocity", "effort")
+                )
+                most = MOST if kind == "prismatic" else math.inf  # turns are cut to two each way
                 if kind != "continuous":
-                    lower = float(self.numbers(limit, "lower", 1, where, "0")[0])
-                    upper = float(self.numbers(limit, "upper", 1, where, "0")[0])
+                    lower, upper = (
+                        float(self.numbers(limit, key, 1, where, "0", most)[0]) for key in ("lower", "upper")
+                    )
         mimic, found = element.find("mimic"), None
         if mimic is not None and kind in _MOVING:
             ratio, offset = (

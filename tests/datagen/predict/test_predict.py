@@ -18,8 +18,9 @@ from datagen import cli
 from tests.datagen.predict.frames import arguments, frame_with
 from tests.refusals import refused
 from tests.small_runs import json_of
-from tests.train.prediction.checkpoints import stored_with, write_untrained
+from tests.train.prediction.checkpoints import document_of, stored_with, write_untrained
 from tests.train.prediction.seen_scenes import MODEL
+from tests.train.prediction.test_trained_robots import SIZES, origin
 
 
 def test_an_answer_as_json_picture_and_page(
@@ -101,10 +102,19 @@ def test_a_robots_file_gives_its_sizes_and_the_heading_of_its_side(
     base = "footprint_m = [[0.3, 0.1], [-0.3, 0.1], [-0.3, -0.1], [0.3, -0.1]]\nheight_m = 0.65\n"
     side = 'presents = "side"\nside_deg = -90\n'
     answers = []
+    document = document_of(made / "model.ckpt")
+    record = origin(robots=SIZES, presents="side", side_deg=-90.0)
+    trained = document["head"] | {"data": [record]}
+    checkpoints = {"ahead": made / "model.ckpt", "right": tmp_path / "right.ckpt"}
+    stored_with(checkpoints["right"], made / "model.ckpt", head=trained)
     for name, more in (("ahead", ""), ("right", side)):
         (tmp_path / f"{name}.toml").write_text(panda.replace("pedestal = true\n", base + more))
         robot = ("--robot", str(tmp_path / f"{name}.toml"))
-        answers.append(json_of(capsys, arguments(made, *robot, drop=("--base-height", "--reach"))))
+        line = arguments(made, *robot, drop=("--base-height", "--reach"))
+        (other,) = checkpoints.keys() - {name}
+        words = ("--robot", "face the target", "have the target -90 deg from their front")
+        refused([line[0], str(checkpoints[other]), *line[2:]], capsys, *words)
+        answers.append(json_of(capsys, [line[0], str(checkpoints[name]), *line[2:]]))
     _, right = answers
     assert right["robot"]["base_height_m"] == 0.65 and right["robot"]["arm_reach_m"] == 0.947
     turns = [
@@ -116,7 +126,8 @@ def test_a_robots_file_gives_its_sizes_and_the_heading_of_its_side(
     assert at_right[1] < -0.1 and abs(at_right[0]) < 1e-6
     states = [[c["state"] for c in each["candidates"]] for each in answers]
     assert states[0] != states[1]  # the base is longer than wide
-    own = json_of(capsys, arguments(made, *robot, "--base-height", "0.8", drop=("--reach",)))
+    again = arguments(made, *robot, "--base-height", "0.8", drop=("--reach",))
+    own = json_of(capsys, [again[0], str(checkpoints["right"]), *again[2:]])
     assert own["robot"]["base_height_m"] == 0.8
     refused(arguments(made, "--robot", "hal"), capsys, "--robot", "hal", "panda")
     refused(arguments(made, "--robot", "panda-scaled", drop=("--reach",)), capsys, "--reach", "missing")

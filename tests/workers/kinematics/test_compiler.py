@@ -12,8 +12,15 @@ import datagen
 
 ASK = """
 import numpy as np
+from datagen.workers.kinematics import on_compiling
+from datagen.workers.kinematics.compiler import is_kept
 from datagen.workers.motion.path_search import dense
-print(len(dense(np.ones(2), np.array([[0.0, 0.0], [0.0, 1.0]]), 2.0)), sum(dense.stats.cache_hits.values()))
+told, kept = [], is_kept(dense)
+with on_compiling(lambda: told.append(1)):
+    points = dense(np.ones(2), np.array([[0.0, 0.0], [0.0, 1.0]]), 2.0)
+hits = sum(dense.stats.cache_hits.values())
+assert (len(told), kept, is_kept(dense)) == ASKED[hits], (told, kept, is_kept(dense))
+print(len(points), hits)
 """
 
 
@@ -22,9 +29,9 @@ def test_code_is_loaded_and_made_again_where_sources_changed_or_it_is_damaged(tm
     shutil.copytree(Path(datagen.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
     environment = os.environ | {"PYTHONPATH": str(tmp_path), "DATAGEN_CACHE": str(cache)}
 
-    def asked() -> list[int]:
+    def asked(compiling: str = "(1, False, True)") -> list[int]:
         told = subprocess.run(
-            [sys.executable, "-c", ASK],
+            [sys.executable, "-c", f"ASKED = {{0: {compiling}, 1: (0, True, True)}}\n{ASK}"],
             check=False,
             cwd=tmp_path,
             env=environment,
@@ -38,11 +45,11 @@ def test_code_is_loaded_and_made_again_where_sources_changed_or_it_is_damaged(tm
     assert asked() == [2, 1]
     for path in (cache / "machine-code").rglob("*.code"):
         path.write_bytes(path.read_bytes()[:-9])
-    assert asked() == [2, 0]
+    assert asked("(1, True, True)") == [2, 0]
     # `dense` calls a function of another file.
     callee = package / "workers" / "motion" / "arm_motion.py"
     callee.write_text(callee.read_text().replace("return max(1, math", "return max(2, math"))
     assert asked() == [3, 0]
     shutil.rmtree(cache)
     cache.write_text("a file where the folder should be")
-    assert asked() == [3, 0]
+    assert asked("(1, False, False)") == [3, 0]

@@ -56,6 +56,10 @@ def build(tmp_path: Path, text: str) -> Callable[..., None]:
         ('lower="0.0" upper="0.04"', 'lower="0.04" upper="0.04"', "hand.range.panda_finger_joint1", "empty"),
         ('<axis xyz="0 -1 0"/>', '<axis xyz="0 1 0"/>', "hand", "both sides"),
         ('<axis xyz="0 -1 0"/>', '<axis xyz="0 0 0"/>', "panda_finger_joint2", "no length"),
+        ('<axis xyz="0 -1 0"/>', '<axis xyz="1e200 0 0"/>', "panda_finger_joint2", "beyond 1,000,000"),
+        ('lower="0.0" upper="0.04"', 'lower="0.0" upper="1e300"', "panda_finger_joint1", "beyond 1,000,000"),
+        ('<mimic joint', '<mimic multiplier="-1e300" joint', "panda_finger_joint2", "beyond 1,000,000"),
+        ('<box size="22e-3 15e-3 20e-3"/>', '<box size="1e300 1 1"/>', "leftfinger", "beyond 1,000,000"),
         ('<parent link="panda_link2"/>', '<parent link="panda_linkx"/>', "panda_joint3", "panda_linkx"),
         ('<parent link="panda_link0"/>', '<parent link="panda_link7"/>', "panda_link", "loop"),
         ('<child link="panda_link3"/>', '<child link="panda_link2"/>', "joints", "two parents"),
@@ -64,11 +68,22 @@ def build(tmp_path: Path, text: str) -> Callable[..., None]:
         ("collision/link3.stl", "collision/gone.stl", "", "No such file"),
         ('<box size="22e-3 15e-3 20e-3"/>', "<torus/>", "panda_leftfinger", "has no box, cylinder"),
         ('<box size="22e-3 15e-3 20e-3"/>', '<cylinder radius="0.01"/>', "panda_leftfinger", "length"),
+        ('<box size="22e-3 15e-3 20e-3"/>', '<box size="1e-12 1 1"/>', "panda_leftfinger", "no volume"),
+        ('<box size="22e-3 15e-3 20e-3"/>', '<sphere radius="1e-30"/>', "panda_leftfinger", "no volume"),
+        ('collision/link3.stl"', 'collision/link3.stl" scale="0 0 0"', "panda_link3", "no volume"),
+        ('collision/link3.stl"', 'collision/link3.stl" scale="1 1e-30 1"', "panda_link3", "no volume"),
         ('<box size="22e-3 15e-3 20e-3"/>', '<sphere radius="0"/>', "panda_leftfinger", "no volume"),
         ('<box size="22e-3 15e-3 20e-3"/>', '<box size="1 2"/>', "panda_leftfinger", "3 finite numbers"),
         ('<mass value="4.970684"/>', '<mass value="-1"/>', "panda_link1", "negative"),
         ('<mass value="4.970684"/>', '<mass value="heavy"/>', "panda_link1", "heavy"),
+        ("franka_description/meshes/collision/link3.stl", "x" * 10**6, "panda_link3", "1,000,000 char"),
         ('<link name="panda_link5">', "<link>", "link", "no name"),
+        ('<link name="panda_link5">', f'<link name="{"x" * 10**6}">', "link xxx", "1,000,000 characters"),
+        ('<parent link="panda_link2"/>', f'<parent link="{"x" * 10**6}"/>', "panda_joint3", "not exist"),
+        ('<mimic joint="panda_finger_joint1"', f'<mimic joint="{"x" * 10**6}"', "joint xx", "is missing"),
+        ('"panda_joint7" type="revolute"', f'"panda_joint7" type="{"x" * 10**6}"', "joint7", "not one of"),
+        ('lower="-1.7628" upper="1.7628"', f'lower="{"9" * 10**6}"', "panda_joint2", "not 1 finite"),
+        ('<mass value="4.970684"/>', f'<mass value="{"x" * 10**6}"/>', "panda_link1", "not 1 numbers"),
     ],
 )  # fmt: skip
 def test_broken_urdfs_are_refused_by_field(
@@ -79,7 +94,19 @@ def test_broken_urdfs_are_refused_by_field(
         build(text.replace(pattern, other, 1))
     assert field in refused.value.field and said in refused.value.problem
     assert re.search(r"panda\.urdf|\.stl|robot\.toml", refused.value.place)
-    assert "\n" not in str(refused.value)
+    assert "\n" not in str(refused.value) and len(str(refused.value)) < 600
+
+
+def test_joints_that_mimic_one_another_do_not_multiply_without_end(tmp_path: Path) -> None:
+    links = "".join(f'<link name="l{k}"/>' for k in range(5))
+    joints = "".join(
+        f'<joint name="j{k}" type="prismatic"><parent link="l{k}"/><child link="l{k + 1}"/>'
+        f'<limit lower="0" upper="1"/><mimic joint="j{k + 1}" multiplier="1e4"/></joint>'
+        for k in range(4)
+    ).replace('<mimic joint="j4" multiplier="1e4"/>', "")
+    (tmp_path / "a.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
+    with pytest.raises(InputError, match=r"a\.urdf: joint j3: is mimicked 1e\+12 times"):
+        read_urdf(tmp_path / "a.urdf")
 
 
 def test_a_missing_or_empty_file_is_named(tmp_path: Path) -> None:
