@@ -31,7 +31,18 @@ PICTURES: dict[str, list[tuple[str, ...]]] = {
         ("submit", "sim", "--n", "120", *NEAR, "--out", "run"),
         ("show", "run", "--scene", "1", "--trial", "best", "--out", "trial.png"),
     ],
+    "places.png": [
+        ("submit", "plan", "--n", "30", "--config", "run.toml", *NEAR, "--out", "run"),
+        ("show", "run", "--scene", "0", "--out", "places.png"),
+    ],
     "predict.png": [("predict", "--demo", "--out", "predict.png", "--html", "page.html")],
+}
+
+
+# What a picture's commands find in their folder as run.toml.
+CONFIGS = {
+    "places.png": "[scene]\nn_clutter = 4\ndecisive = 1.0\n[scene.places]\ninside = 1\n[candidates]\nper_scene = 30\n"
+    "arm_reach_m = {low = 0.9, high = 1.0}\n"
 }
 
 
@@ -40,6 +51,7 @@ def make(name: str, out: Path) -> None:
     before = Path.cwd()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
+        Path("run.toml").write_text(CONFIGS.get(name, ""))
         try:
             for words in PICTURES[name]:
                 if cli.run([*words, *(("--workers", "0") if words[0] == "submit" else ())]):

@@ -32,6 +32,8 @@ from datagen.workers.scenes.reconstruct import ReconstructedScene
 Columns = Mapping[str, Any]
 Lines = list[tuple[str, str]]  # printed next to a picture
 
+# Where the target is, by the code of its place.
+_WHERE = ("on", "on a board of", "inside", "on", "on the floor by", "in")
 _MOST_ROBOTS = 4
 _SIDES = 49  # of a drawn circle
 _PLANS_IN = 3.7  # height of the upper half
@@ -58,7 +60,8 @@ class Shown:
     @property
     def target(self) -> str:
         record = self.rows.record
-        return f"{self.recalled.models[0].name} on {record['support_type']}, {record['room_type']}"
+        where = _WHERE[int(record.get("place", 0))]
+        return f"{self.recalled.models[0].name} {where} {record['support_type']}, {record['room_type']}"
 
     @cached_property
     def frame(self) -> Frame:
