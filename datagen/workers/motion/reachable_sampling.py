@@ -59,13 +59,14 @@ def reachable_set(tree: KinematicTree, shoulder_m: F64, reach_m: float) -> Reach
     tree = tree._replace(frame_joint=tree.frame_joint[-1:], T_joint_frame=tree.T_joint_frame[-1:]).along_z()
     fields = tuple((a.tobytes(), a.dtype.str, a.shape) for a in map(np.ascontiguousarray, tree))
     x, y, z = shoulder_m.tolist()
-    return _of(fields, math.hypot(x, y) + reach_m, z - reach_m, reach_m)
+    return sampled_set(fields, math.hypot(x, y) + reach_m, z - reach_m, reach_m)
 
 
 @lru_cache(maxsize=64)
-def _of(
+def sampled_set(
     fields: tuple[tuple[bytes, str, tuple[int, ...]], ...], far_m: float, lowest_m: float, reach_m: float
 ) -> ReachableSet:
+    """The set of a tree's fields: bytes, type, shape. No TCP is farther than `far_m` or below `lowest_m`."""
     cell_m = reach_m / _CELLS_PER_REACH
     shape = (math.ceil(far_m / cell_m + _EDGE), 2 * _CELLS_PER_REACH + 1, LEVELS * AZIMUTHS)
     key = sha256(repr((VERSION, fields, far_m, lowest_m, reach_m)).encode()).hexdigest()

@@ -38,35 +38,34 @@ class ReachableSet:
     lowest_m: float
 
     @cached_property
-    def near(self) -> Bits:
-        """Sectors (D, H) that are reached in any direction there or in a cell next to it."""
+    def inside(self) -> Bits:
+        """Sectors (D, H) reached in any direction. Gaps of one cell, which samples leave, are filled."""
         found = np.bitwise_or.reduce(self.sectors.reshape(*self.sectors.shape[:2], -1), axis=2)
-        found = found | _rotated(found, 1) | _rotated(found, SECTORS - 1)
-        for axis in (0, 1):
-            low, high = np.zeros_like(found), np.zeros_like(found)
-            to, of = [slice(None)] * 2, [slice(None)] * 2
-            to[axis], of[axis] = slice(1, None), slice(None, -1)
-            low[tuple(to)], high[tuple(of)] = found[tuple(of)], found[tuple(to)]
-            found = found | low | high
-        # The innermost ring has no direction.
-        found[0] = np.where(found[0] > 0, _ALL, found[0])
-        return found
+        return found | ~_spread(~_spread(found))
+
+    @cached_property
+    def near(self) -> Bits:
+        """Sectors (D, H) that are inside, or next to one that is."""
+        return _spread(self.inside)
 
     @property
     def farthest_m(self) -> float:
         """Horizontal distance from the mount beyond which no position is reached."""
         return self.cell_m * float(np.flatnonzero(self.near.any(axis=1)).max(initial=-1) + 1)
 
-    def holds(self, positions_base_m: F64) -> Bools:
-        """Whether the TCP gets to positions (N, 3), base frame, up to a cell and 1/64 of a turn."""
+    def holds(self, positions_base_m: F64, or_next: bool = False) -> Bools:
+        """Whether the TCP gets to the cells of positions (N, 3), base frame, or to one next to them.
+
+        Without `or_next` a position at the border that is reached may be missing.
+        """
         x, y, z = positions_base_m.T
+        cells = self.near if or_next else self.inside
         ring = np.floor(np.hypot(x, y) / self.cell_m).astype(np.int64)
         layer = np.floor((z - self.lowest_m) / self.cell_m).astype(np.int64)
-        rings, layers = self.near.shape
-        inside = (ring < rings) & (layer >= 0) & (layer < layers)
-        bits = self.near[np.where(inside, ring, 0), np.where(inside, layer, 0)]
+        is_there = (ring < cells.shape[0]) & (layer >= 0) & (layer < cells.shape[1])
+        bits = cells[np.where(is_there, ring, 0), np.where(is_there, layer, 0)]
         sector = np.floor(np.arctan2(y, x) / (2 * np.pi) * SECTORS).astype(np.int64) % SECTORS
-        return inside & ((bits >> sector.astype(np.uint64)) & _ONE).astype(np.bool_)
+        return is_there & ((bits >> sector.astype(np.uint64)) & _ONE).astype(np.bool_)
 
     def directions_at(self, azimuth_rad: float) -> F32:
         """Whether (D, H, LEVELS, AZIMUTHS) the TCP gets to each ring and layer there: 0 or 1."""
@@ -74,8 +73,17 @@ class ReachableSet:
         return ((self.sectors >> np.uint64(sector)) & _ONE).astype(np.float32)
 
 
-def _rotated(bits: Bits, by: int) -> Bits:
-    return (bits << np.uint64(by)) | (bits >> np.uint64(SECTORS - by))
+def _spread(bits: Bits) -> Bits:
+    """Sectors (D, H) of the cells and of those next to them. The innermost ring has no direction."""
+    by = np.uint64(SECTORS - 1)
+    found = bits | (bits << _ONE) | (bits >> by) | (bits >> _ONE) | (bits << by)
+    found[0] = np.where(found[0] > 0, _ALL, found[0])
+    for axis in (0, 1):
+        lower, upper = np.zeros_like(found), np.zeros_like(found)
+        rows = np.swapaxes(found, 0, axis)
+        np.swapaxes(lower, 0, axis)[1:], np.swapaxes(upper, 0, axis)[:-1] = rows[:-1], rows[1:]
+        found = found | lower | upper
+    return found
 
 
 def direction_parts(directions: F64, ahead_rad: F64 | float = 0.0) -> tuple[F64, F64]:

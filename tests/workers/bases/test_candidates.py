@@ -225,8 +225,8 @@ def plain_candidates(
 def seen_from(bases: SceneCandidates, target_m: np.ndarray) -> np.ndarray:
     """The target (N, 3) in the frames of the mounts."""
     T = [
-        yaw_pose(*xy, height, yaw)
-        for xy, height, yaw in zip(
+        yaw_pose(x, y, height, yaw)
+        for (x, y), height, yaw in zip(
             bases.base_xy_m.tolist(), bases.base_height_m.tolist(), bases.base_yaw_rad.tolist(), strict=True
         )
     ]
