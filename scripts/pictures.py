@@ -41,8 +41,8 @@ PICTURES: dict[str, list[tuple[str, ...]]] = {
 
 # What a picture's commands find in their folder as run.toml.
 CONFIGS = {
-    "places.png": "[scene]\nn_clutter = 4\ndecisive = 1.0\n[scene.places]\ninside = 1\n[candidates]\nper_scene = 30\n"
-    "arm_reach_m = {low = 0.9, high = 1.0}\n"
+    "places.png": "[scene]\nn_clutter = 4\ndecisive = 1.0\n[scene.places]\ninside = 1\n"
+    "[candidates]\nper_scene = 30\narm_reach_m = {low = 0.9, high = 1.0}\n"
 }
 
 

@@ -132,19 +132,21 @@ def grid_tables(report: Report, grids: Report) -> Iterator[Table]:
             with_interval(values["good"]),
             _metres(values["missed_m"]),
             with_interval(values["mean_average_precision"]),
+            with_interval(values["feasibility"]) if "feasibility" in values else "-",
             time_s,
         )
         for name, values, time_s in (*methods, *((mean["name"], mean, "-") for mean in grids["means"]))
     ]
     paper, chance = report["paper"], percent(grids["any_clear"])
-    paper_values = (percent(paper["grid_selection"]), f"{paper['grid_miss_m']:.2f}", "-")
-    rows.append(("any clear candidate", chance, "-", chance, "-"))
+    paper_values = (percent(paper["grid_selection"]), f"{paper['grid_miss_m']:.2f}", "-", "-")
+    rows.append(("any clear candidate", chance, "-", chance, "50.0", "-"))
     rows.append(("paper, two-stage", *paper_values, f"{paper['seconds_per_600']:g}"))
     without = grids["scenes_without_positive"]
     title = (
         f"Table III: {grids['scenes'] - without:,} whole grids with a positive candidate, {without:,} without"
     )
-    yield Table(title, ("method", "choice positive (%)", "else missed by (m)", "mAP (%)", "600 in (s)"), rows)
+    heads = ("choice positive (%)", "else missed by (m)", "mAP (%)", "feasibility AUC", "600 in (s)")
+    yield Table(title, ("method", *heads), rows)
     yield from comparison_tables(grids["comparisons"], "whole grids")
     if grids["arrivals"]:
         yield _arrivals(report, grids["arrivals"])

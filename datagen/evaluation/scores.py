@@ -143,7 +143,11 @@ def evaluate_grids(
 
 
 def _picked(columns: Columns, method: Method, weights: Weights) -> dict[str, Estimate]:
-    """Means over robots with a good clear candidate: good picks, miss distance, average precision."""
+    """Means over robots with a good clear candidate: good picks, miss distance, average precision.
+
+    `feasibility` is the area under the ROC curve of a scene's highest score of a clear candidate, as a
+    predictor of whether any is good.
+    """
     score = columns.scores[method.name]
     chosen = select(score, columns.label, columns.base_xy_m, columns.robot, columns.is_clear)
     scene_of = np.zeros(int(columns.robot.max(initial=-1)) + 1, np.int64)
@@ -159,7 +163,13 @@ def _picked(columns: Columns, method: Method, weights: Weights) -> dict[str, Est
         return metrics.ratio(sums[..., first], sums[..., first + 1])
 
     trials = {"good": int((per_scene[:, 1] > 0).sum())}
-    return {
+    highest = np.full(columns.n_scenes, -np.inf)
+    np.maximum.at(highest, columns.scene[columns.is_clear], score[columns.is_clear])
+    offers = np.flatnonzero(np.isfinite(highest))
+    feasible = np.bincount(columns.scene, columns.label & columns.is_clear, columns.n_scenes)[offers] > 0
+    area = metrics.area_under_roc(feasible, highest[offers])
+    drawn_area = resampled_area_under_roc(weights, feasible, highest[offers], offers)
+    return {"feasibility": Estimate(area, drawn_area)} | {
         name: Estimate(float(share(whole, first)), share(drawn, first), trials.get(name, 0))
         for name, first in (("good", 0), ("missed_m", 2), ("mean_average_precision", 4))
     }
