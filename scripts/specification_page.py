@@ -32,6 +32,7 @@ _EXAMPLES = {
     "  # absent, or 3..100 corners",
     "scene.places": "{top=3, shelf=2}  # absent, or weights of top, shelf, inside, seat, floor and sink",
     "scene.decisive": "0.5  # absent, or 0..1",
+    "candidates.within": "\"in-range\"  # absent, or 'clear' or 'in-range'",
     "candidates.yaw_rad": "{low=-0.5, high=0.5}  # absent, or within -3.14159..3.14159",
 }
 _LENGTH = {"≥": "0", "≤": "100"}  # the bounds of every length

@@ -38,8 +38,9 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
     made = run_shard(task.spec, world, task.scene_indices, stored, meter.watch)
     with ends_job(), made.clock.stage("write"):
         # A run of an older version keeps its arrays.
+        scene = {field.name: made.scene[field.name] for field in run.schema.scene_fields}
         sample = {field.name: made.sample[field.name] for field in run.schema.sample_fields}
-        data = encode_shard(run.schema, run.layout, spec_hash, made.scene, sample)
+        data = encode_shard(run.schema, run.layout, spec_hash, scene, sample)
         entry = run.write_object(task.attempt, data)
     labels = made.sample["label"]
     cost = meter.cost(made.clock, written_bytes=entry.size)

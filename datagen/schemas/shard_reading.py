@@ -191,7 +191,14 @@ class ShardPlace:
         for array, place, data in self.chunks(wanted.values()):
             parts[array.name].append(decode_chunk(place, array, data))
         read = {name: self._joined(array, parts[name]) for name, array in wanted.items()}
-        return {each.name: self._facing(read) if each.computed_from else read[each.name] for each in asked}
+        return {
+            each.name: self._computed(each, read) if each.computed_from else read[each.name] for each in asked
+        }
+
+    def _computed(self, array: StoredArray, read: Mapping[str, Array]) -> Array:
+        if array.name == "base_yaw_rad":
+            return self._facing(read)
+        return np.zeros(len(read[array.computed_from[0].name]), array.dtype)
 
     def _facing(self, read: Mapping[str, Array]) -> Array:
         """Headings that face the target: those of stores without headings."""

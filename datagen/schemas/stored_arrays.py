@@ -19,7 +19,7 @@ from numcodecs.vlen import VLenUTF8
 from numcodecs.zstd import Zstd
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import SAMPLE_FIELDS, RecordSchema
+from datagen.schemas.fields import SAMPLE_FIELDS, SCENE_FIELDS, RecordSchema
 from datagen.schemas.run_records import Layout
 from datagen.schemas.shard_files import MAX_TEXT_BYTES, chunk_path, field_attributes, group_metadata
 
@@ -30,9 +30,15 @@ MAX_DECODED_BYTES = 2**30  # far above any real chunk
 _MAX_PER_FILE = 2**20
 _NUMBERS = {"bool", "float16", "float32", "float64"}
 _NUMBERS |= {f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)}
-# Arrays that stores of older versions lack, and those of which readers compute them (`ShardPlace.read`).
-COMPUTED = {"base_yaw_rad": ("base_xy_m", "target_center_m")}
-_ATTRIBUTES = {field.name: field_attributes(field) for field in SAMPLE_FIELDS if field.name in COMPUTED}
+# Arrays that stores of older versions lack, and those of which readers compute them (`ShardPlace.read`):
+# headings face the target, and numbers of scenes are 0, as on an open top (place) and not chosen by labels.
+COMPUTED = {
+    "base_yaw_rad": ("base_xy_m", "target_center_m"),
+    "place": ("scene_index",),
+    "good_share": ("scene_index",),
+    "decisive_draws": ("scene_index",),
+}
+_FIELDS = {field.name: field for field in (*SCENE_FIELDS, *SAMPLE_FIELDS) if field.name in COMPUTED}
 DAMAGE_FIX = "Restore the file from a copy, or set the shard aside with `datagen verify --repair`"
 
 
@@ -125,8 +131,9 @@ def readable(names: Iterable[str], stored: Mapping[str, StoredArray]) -> dict[st
 def _computed(name: str, stored: Mapping[str, StoredArray]) -> StoredArray:
     sources = tuple(stored[source] for source in COMPUTED[name])
     first = sources[0]
-    like = replace(first, name=name, shape=first.shape[:1], dims=first.dims[:1], attributes=_ATTRIBUTES[name])
-    return replace(like, computed_from=sources)
+    like = replace(first, name=name, shape=first.shape[:1], dims=first.dims[:1])
+    field = _FIELDS[name]
+    return replace(like, dtype=field.dtype, attributes=field_attributes(field), computed_from=sources)
 
 
 def facing_rad(towards_m: Array) -> npt.NDArray[np.float64]:

@@ -35,8 +35,6 @@ from datagen.workers.world import World
 Columns = dict[str, np.ndarray[Any, Any]]
 
 MOST_DECISIVE_DRAWS = 40
-# Values of fields that records of older stores lack.
-_OLD = {"place": 0, "decisive_draws": 0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,12 +71,13 @@ def run_shard(
         if rows is None:
             scene, candidates, labelled, draws = _labelled_scene(world, index, source, clock)
             redraws.update(scene.redraws)
-            record = scene_row(scene, spec) | {"decisive_draws": draws}
+            drawn = {"decisive_draws": draws, "good_share": good_share(candidates, labelled)}
+            record = scene_row(scene, spec) | drawn
         else:
             scene = _stored_scene(world, index, rows, clock)
             candidates = reconstruct_candidates(rows.samples, scene)
-            labelled, record = source.label(scene, candidates, spec, clock), {**_OLD, **rows.record}
-        scene_rows.append(record | {"good_share": good_share(candidates, labelled)})
+            labelled, record = source.label(scene, candidates, spec, clock), rows.record
+        scene_rows.append(record)
         sample_blocks.append(candidate_columns(index, candidates, spec_hash, source) | labelled)
         clock.labels = sum(len(block["label"]) for block in sample_blocks)
 

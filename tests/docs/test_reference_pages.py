@@ -62,5 +62,6 @@ def test_the_example_of_a_specification_has_the_defaults_also_where_it_comments_
     assert set(fields["arm"]) == set(ArmParams.model_fields) - {"robot_digest", "joints", "draws"}
     corners = ((0.3, 0.2), (-0.3, 0.2), (-0.3, -0.2), (0.3, -0.2))
     turns = Turns(low=-0.5, high=0.5)
-    absent = {"within": "clear", "scaled_base": True, "footprint_m": corners, "yaw_rad": turns}
+    near = {"within": "in-range", "in_range_by": "reachable-set"}
+    absent = {**near, "scaled_base": True, "footprint_m": corners, "yaw_rad": turns}
     assert spec.candidates == CandidateParams(**absent)
