@@ -6,7 +6,7 @@ Runs of `plan` or `sim` by a robot that is not scaled; needs the extra `pybullet
 the stored joints of each success, and this prints
 
 - how far that puts the TCP from the stored pose of the hand: mm and degrees, mean and largest
-- successes with a joint outside the limits that Bullet reads, and the least share of a range left to a limit
+- successes with a joint outside the limits that Bullet reads
 - how far the TCP lies from the tool frame of the hand's makers, mm, where the URDF has one
 
 The mount, coupled joints and the hand's flange are worked out here again. Only the pose of the TCP in the
@@ -174,7 +174,7 @@ def main() -> None:
     parser.add_argument("runs", nargs="+", metavar="RUN")
     parser.add_argument("--most", type=int, default=200, help="successes to check in each run")
     options = parser.parse_args()
-    print("robot       checked  mm mean      largest    degrees     outside  least margin  tool frame mm")
+    print("robot       checked  mm mean  largest  degrees, largest  outside  tool frame mm")
     for path in options.runs:
         _print_run(Run.open(path), options.most)
 
@@ -213,8 +213,8 @@ def _print_run(run: Run, most: int) -> None:
     gap_mm, angle_deg, margin = np.array(rows).T
     outside = int((margin < -ROUNDING).sum())
     print(
-        f"{name:<12}{len(rows):7d}{gap_mm.mean():9.5f}{gap_mm.max():13.5f}{angle_deg.max():11.6f}"
-        f"{outside:12d}{margin.min():14.4f}{1e3 * second.tool_gap_m:15.1f}"
+        f"{name:<12}{len(rows):7d}{gap_mm.mean():9.5f}{gap_mm.max():9.5f}{angle_deg.max():18.6f}"
+        f"{outside:9d}{1e3 * second.tool_gap_m:15.1f}"
     )
 
 
