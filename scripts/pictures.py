@@ -1,6 +1,6 @@
 """Make the pictures of the documents, on the built-in world.
 
-    python -m scripts.pictures [FOLDER]        (make pictures; FOLDER is docs/images)
+    python -m scripts.pictures [FOLDER [NAME...]]        (make pictures; FOLDER is docs/images)
 
 A test makes each of them again and compares it with the one that is kept.
 """
@@ -12,11 +12,25 @@ import sys
 import tempfile
 from pathlib import Path
 
+from PIL import Image
+
 from datagen import cli
 
 IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
 GRID = ("--candidates-per-scene", "grid")
 NEAR = ("--candidates", "in-range")
+ROBOTS = ("stretch3", "tiago-pro", "ur5", "pr2", "fetch")
+SMALL_PX, QUALITY = 880, 65  # width of the robots' pictures, and quality of their compression
+
+
+def _trial(robot: str) -> list[tuple[str, ...]]:
+    few = ("--n", "6", "--candidates-per-scene", "6", "--seed", "4")
+    return [
+        ("submit", "sim", *few, *NEAR, "--robot", robot, "--out", "run"),
+        ("show", "run", "--scene", "0", "--trial", "best", "--out", "sheet.png"),
+    ]
+
+
 # The commands of each picture, in a folder of its own; `make demo` makes the first.
 PICTURES: dict[str, list[tuple[str, ...]]] = {
     "labels.png": [
@@ -36,6 +50,7 @@ PICTURES: dict[str, list[tuple[str, ...]]] = {
         ("show", "run", "--scene", "0", "--out", "places.png"),
     ],
     "predict.png": [("predict", "--demo", "--out", "predict.png", "--html", "page.html")],
+    **{f"{robot}.webp": _trial(robot) for robot in ROBOTS},
 }
 
 
@@ -56,12 +71,21 @@ def make(name: str, out: Path) -> None:
             for words in PICTURES[name]:
                 if cli.run([*words, *(("--workers", "0") if words[0] == "submit" else ())]):
                     raise RuntimeError(f"datagen {' '.join(words)}: failed")
+            if name.endswith(".webp"):
+                _shrink(Path("sheet.png"), Path(name))
             out.write_bytes(Path(name).read_bytes())
         finally:
             os.chdir(before)
 
 
+def _shrink(sheet: Path, out: Path) -> None:
+    with Image.open(sheet) as picture:
+        size = SMALL_PX, round(picture.height * SMALL_PX / picture.width)
+        small = picture.convert("RGB").resize(size, Image.Resampling.LANCZOS)
+    small.save(out, quality=QUALITY, method=6)
+
+
 if __name__ == "__main__":
     target = Path(sys.argv[1] if len(sys.argv) > 1 else IMAGES).resolve()
-    for picture in PICTURES:
+    for picture in sys.argv[2:] or PICTURES:
         make(picture, target / picture)

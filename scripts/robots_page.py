@@ -49,7 +49,13 @@ it by at most 4.1 mm on the arms and hands of ManiSkill's robots and 9 mm on Fet
 within the base's outline, are omitted.
 
 `OMP_NUM_THREADS=1 python -m benchmarks.robots` measures inverse kinematics and collision checks.
+Bullet, from the URDFs alone, [finds the same poses](../results/labels.md#robots).
+
+## Trials
+
+Executed trials, from far and from near, as `datagen show RUN --scene 0 --trial best` draws them:
 """
+_TRIALS = ("stretch3", "tiago-pro", "ur5", "pr2", "fetch")
 _COLUMNS = ("name", "coordinates", "reach m", "mount m", "base", "hand", "from")
 _PRESENTS = {"faces": "", "side": ", sideways", "turns": ", turns in place"}
 
@@ -57,7 +63,9 @@ _PRESENTS = {"faces": "", "side": ", sideways", "turns": ", turns in place"}
 def page() -> str:
     """The page's text. InputError where the files of a robot are not installed."""
     rows = [_COLUMNS, ("---",) * len(_COLUMNS), *map(_row, ROBOTS)]
-    return _HEAD + "".join(f"| {' | '.join(row)} |\n" for row in rows) + _TAIL
+    table = "".join(f"| {' | '.join(row)} |\n" for row in rows)
+    trials = [f"\n![{name} lifts a ball from a dresser](../images/{name}.webp)\n" for name in _TRIALS]
+    return _HEAD + table + _TAIL + "".join(trials)
 
 
 def _row(name: str) -> tuple[str, ...]:

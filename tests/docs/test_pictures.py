@@ -9,16 +9,22 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scripts.pictures import IMAGES, PICTURES, make
+from scripts.pictures import IMAGES, PICTURES, ROBOTS, make
 from tests.conftest import REPOSITORY
-from tests.sim_extra import needs_sim
+from tests.sim_extra import needs_robots, needs_sim
 
 # Those that need planning or physics take longer than a test of every change may.
 SLOW = {"outcomes.png", "trial.png"}
-NAMES = [pytest.param(name, marks=[needs_sim, pytest.mark.slow] if name in SLOW else []) for name in PICTURES]
+TRIALS = {f"{robot}.webp" for robot in ROBOTS}
 
 
-@pytest.mark.parametrize("name", NAMES)
+def marks(name: str) -> list[pytest.MarkDecorator]:
+    if name not in SLOW | TRIALS:
+        return []
+    return [needs_sim, pytest.mark.slow, *([needs_robots] if name in TRIALS else [])]
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in PICTURES])
 def test_a_picture_is_that_of_the_present_program(name: str, tmp_path: Path) -> None:
     make(name, tmp_path / name)
     with Image.open(tmp_path / name) as drawn, Image.open(IMAGES / name) as kept:

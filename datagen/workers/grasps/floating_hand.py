@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import inverse, rotation_of, translation
-from datagen.workers.robots.gripper import Gripper, Parts
+from datagen.workers.robots.gripper import Gripper
 from datagen.workers.settling.sapien_physics import (
     add_object,
     convex_shape,
@@ -26,6 +26,8 @@ _GRAVITY_MPS2 = 9.81
 # A finger's joint: its x axis, along which it moves, is the hand's y for finger 0 and -y for finger 1.
 _JOINT_AXES = (np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]))
 _NO_TORQUE = [0.0, 0.0, 0.0]
+# Fingers that turn slide here, in one posture, so that their roots would meet before their pads do.
+_NOT_ITSELF = [2, 1, 0, 0]  # SAPIEN's collision groups: this hand touches the object alone
 _FINGER_MASS_KG = 0.05
 _FINGER_INERTIA_KGM2 = 1e-4
 
@@ -178,7 +180,11 @@ def _add_hand(
     hand = builder.build(fix_root_link=True)
     parts_m = (gripper.palm_parts_m, *gripper.fingers_near(opening_m))
     for link, parts in zip(hand.links, parts_m, strict=True):
-        _attach(link, parts, rubber)
+        for part in parts:
+            shape = convex_shape(part, rubber)
+            if gripper.linkage is not None:
+                shape.set_collision_groups(_NOT_ITSELF)
+            link.attach(shape)
         _tune(link, test)
     for finger in hand.links[1:]:
         finger.set_mass(_FINGER_MASS_KG)
@@ -191,11 +197,6 @@ def _add_hand(
         joint.set_friction(0.0)
         joint.set_drive_properties(0.0, test.grip_force_n / test.closing_mps)
         joint.set_drive_velocity_target(-test.closing_mps)
-
-
-def _attach(link: physx.PhysxArticulationLinkComponent, parts: Parts, rubber: physx.PhysxMaterial) -> None:
-    for part in parts:
-        link.attach(convex_shape(part, rubber))
 
 
 def _tune(body: physx.PhysxRigidBodyComponent, test: HandTest) -> None:

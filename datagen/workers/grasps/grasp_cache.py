@@ -59,6 +59,7 @@ _NO_SCORE = np.zeros(0, np.float32)
 _KEPT_IN_MEMORY = 128
 _POSES = CacheFolder("hand-poses", most_files=1024)  # about 250 KB each
 _SCORES = CacheFolder("grasps", most_files=65_536)
+_TURNING = 2  # as VERSION, of hands whose fingers turn
 # Grasps of an object that are scored in advance; the others only when an arm has a plan to them.
 SCORED_FIRST = 128
 # Most searches of one object; fewer where they find enough poses.
@@ -181,7 +182,7 @@ def content_digest(model: ObjectModel, gripper: Gripper, draw: int = 0) -> str:
     hand = (gripper.max_opening_m, gripper.pad_size_m, gripper.palm_depth_m)
     other: dict[str, Any] = {"draw": draw} if draw else {}
     if gripper.linkage is not None:
-        other["linkage"] = gripper.digest
+        other["linkage"] = [_TURNING, gripper.digest]
     return digest_of(
         {
             "version": VERSION,
