@@ -132,7 +132,7 @@ def grid_tables(report: Report, grids: Report) -> Iterator[Table]:
             with_interval(values["good"]),
             _metres(values["missed_m"]),
             with_interval(values["mean_average_precision"]),
-            with_interval(values["feasibility"]) if "feasibility" in values else "-",
+            percent(values["feasibility"]["value"]) if "feasibility" in values else "-",
             time_s,
         )
         for name, values, time_s in (*methods, *((mean["name"], mean, "-") for mean in grids["means"]))
@@ -145,7 +145,7 @@ def grid_tables(report: Report, grids: Report) -> Iterator[Table]:
     title = (
         f"Table III: {grids['scenes'] - without:,} whole grids with a positive candidate, {without:,} without"
     )
-    heads = ("choice positive (%)", "else missed by (m)", "mAP (%)", "feasibility AUC", "600 in (s)")
+    heads = ("choice positive (%)", "else missed by (m)", "mAP (%)", "feasible AUC", "600 in (s)")
     yield Table(title, ("method", *heads), rows)
     yield from comparison_tables(grids["comparisons"], "whole grids")
     if grids["arrivals"]:
