@@ -28,12 +28,12 @@ U8 = npt.NDArray[np.uint8]
 
 N_STAGES = 3  # the grasp, a straight way back from it, and up
 WAY_M = 0.1
-CODES_PER_UNIT = 24.0  # of log(1 + score); the largest scores have about 8
+CODES_PER_UNIT = 24.0  # of log(1 + weighted number of samples), which is 11 at most
 _REACH_STEP_M = 0.01
 
 
 class PoseReach(NamedTuple):
-    """`score` of a map for each of its cells, as bytes, and what finds a pose's cell."""
+    """Codes of a map's cells, and what finds a pose's cell. A cell of roll is half of each of two."""
 
     code: U8  # (C,)
     axis_xy_m: F64  # (2,)
@@ -65,7 +65,9 @@ def pose_reach(name: str, reach_m: float) -> PoseReach:
 def _coded(reach: ReachMap) -> PoseReach:
     turns = reach.turn >= 0
     count = np.diff(reach.first).reshape(DISTANCES, HEIGHTS, -1, ROLLS, 1 if turns else AZIMUTHS)
-    total = 8 * count + np.roll(count, 1, axis=3) + np.roll(count, -1, axis=3)
+    # Hands are often laid at multiples of 45 degrees to the horizontal, the borders of two cells of roll.
+    count = count + np.roll(count, 1, axis=3)
+    total = 8 * count
     for axis in (0, 1):
         there, here = [slice(None)] * 2, [slice(None)] * 2
         there[axis], here[axis] = slice(1, None), slice(None, -1)
@@ -78,7 +80,7 @@ def _coded(reach: ReachMap) -> PoseReach:
 
 
 def reach_codes(arm: PoseReach, axes: F64, pose_row: Ints, base_xy_m: F64, turn_rad: F64, rise_m: F64) -> U8:
-    """Codes (N, K, N_STAGES) of K poses from each of N bases: CODES_PER_UNIT log(1 + score), 0 out of reach.
+    """Codes (N, K, N_STAGES) of K poses from each of N bases: 0 where no sample of the joints is near.
 
     `axes` (S, K, 3, 3) are TCP, approach and closing axis in the target's frame, zero where there is no pose;
     `pose_row` (N,) has each base's row of them. Bases are at `base_xy_m` (N, 2), target frame, their fronts
@@ -95,6 +97,7 @@ def _look_up(
     arm: PoseReach, axes: F64, pose_row: Ints, base_xy_m: F64, turn_rad: F64, rise_m: F64, found: U8
 ) -> None:
     a, b, wrist = np.empty(3), np.empty(3), arm.tcp_wrist_m
+    half_c, half_s = math.cos(math.pi / ROLLS), math.sin(math.pi / ROLLS)
     step = DIRECTIONS * ROLLS * (1 if arm.turns else AZIMUTHS)
     for n in range(len(pose_row)):
         x0, y0 = base_xy_m[n, 0], base_xy_m[n, 1]
@@ -108,6 +111,8 @@ def _look_up(
             if ax * ax + ay * ay + az * az < 0.5:
                 continue
             ex, ey, ez = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
+            # The closing axis, turned by half a cell of roll.
+            hx, hy, hz = half_c * bx - half_s * ex, half_c * by - half_s * ey, half_c * bz - half_s * ez
             tx, ty = tcp[0] - x0, tcp[1] - y0
             tx, ty, tz = (
                 c * tx + s * ty - arm.axis_xy_m[0],
@@ -134,7 +139,7 @@ def _look_up(
                     # Turned to the front, as the map's samples are.
                     f, g = (px / planar, py / planar) if planar > 1e-9 else (1.0, 0.0)
                     a[0], a[1], a[2] = f * ax + g * ay, f * ay - g * ax, az
-                    b[0], b[1], b[2] = roll * (f * bx + g * by), roll * (f * by - g * bx), roll * bz
+                    b[0], b[1], b[2] = roll * (f * hx + g * hy), roll * (f * hy - g * hx), roll * hz
                     azimuth = 0.0 if arm.turns else math.atan2(py, px)
                     at = cell_of(0.0, -1.0, azimuth, a, b, arm.turns)
                     ring, layer = int(math.floor(i)), int(math.floor(h))
