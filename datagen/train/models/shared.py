@@ -224,15 +224,10 @@ class SharedModel(Model):
             cloud_row = robots.cloud_row[candidates.robot_row]
             some = torch.arange(len(candidates), device=scalars.device).split(size)
             reach = self.hand_reach(tokens, candidates, robots)
+            codes = [None] * len(some) if reach is None else reach.split(size)
             of_tiles = [
-                self.hands(
-                    tokens.hand_poses,
-                    cloud_row[rows],
-                    take_rows(frames, rows),
-                    scalars[rows],
-                    None if reach is None else reach[rows],
-                )
-                for rows in some
+                self.hands(tokens.hand_poses, cloud_row[rows], take_rows(frames, rows), scalars[rows], of)
+                for rows, of in zip(some, codes, strict=True)
             ]
             joined.append(torch.cat(of_tiles))
         return self.head(torch.cat(joined, dim=1)).float()

@@ -134,7 +134,7 @@ def _look_up(
                         pz = wz + WAY_M
                     planar = math.sqrt(px * px + py * py)
                     i, h = planar / arm.half_m * DISTANCES - 0.5, (pz / arm.half_m + 1) / 2 * HEIGHTS - 0.5
-                    if i >= DISTANCES or h <= -1 or h >= HEIGHTS:
+                    if not (i < DISTANCES and -1 < h < HEIGHTS):  # NaN neither
                         continue
                     # Turned to the front, as the map's samples are.
                     f, g = (px / planar, py / planar) if planar > 1e-9 else (1.0, 0.0)

@@ -47,6 +47,10 @@ def test_poses_that_joints_attain_have_codes_and_far_ones_none(name: str, reach_
     assert (codes[:, 0, 0] > reach_codes(arm, axes, row, xy, turn, rise + 0.5)[:, 0, 0]).mean() > 0.7
     assert not reach_codes(arm, axes, row, xy + 5.0, turn, rise).any()
     assert not reach_codes(arm, axes, row, xy, turn, rise - 4.0).any()
+    for wrong in (np.nan, np.inf, -1e30):
+        assert not reach_codes(arm, axes, row, np.full_like(xy, wrong), turn, rise).any()
+        assert not reach_codes(arm, axes, row, xy, turn, np.full_like(rise, wrong)).any()
+    assert not reach_codes(arm, axes, row, xy, np.full_like(turn, np.nan), rise).any()
     flipped = axes * np.array([1.0, 1.0, -1.0])[:, None]  # the fingers are interchangeable
     np.testing.assert_array_equal(reach_codes(arm, flipped, row, xy, turn, rise), codes)
     assert not reach_codes(arm, np.zeros_like(axes), row, xy, turn, rise).any()  # no pose
