@@ -47,14 +47,14 @@ class RunPart:
     @property
     def robot(self) -> str:
         """The robot of its labels as `open_robot` accepts it; "" where labels know no robot."""
-        arm = self.specs[0].arm  # merged runs have one
+        arm = self.specs[0].arm if self.specs else None  # merged runs have one
         return "" if arm is None else arm.robot_key
 
 
 def read_robots(parts: Iterable[RunPart]) -> None:
     """Read the files of robots that runs were made with. InputError where one is missing or has changed."""
     for part in parts:
-        arm = part.specs[0].arm
+        arm = part.specs[0].arm if part.specs else None
         if arm is not None and arm.robot_digest is not None:
             place = part.sources[0].get("robot") if part.sources else None
             remember(place or arm.robot, arm.robot, arm.robot_digest)
