@@ -15,7 +15,7 @@ from datagen.train.models.hand_poses import N_MEASURES
 from datagen.train.models.tokens import turned
 
 _WRIST_M, _WAY_M = 0.2, 0.1  # from the TCP back to the wrist; before the grasp, and up
-_CODE = 100.0  # of reach: brings its codes near 1
+_CODE = 300.0  # of reach: brings its codes near 1
 _NEAR = 0.05  # share of the reach; nearer to the mount a direction is noise
 N_SEEN_FROM_MOUNT = 26
 

@@ -28,7 +28,9 @@ U8 = npt.NDArray[np.uint8]
 
 N_STAGES = 3  # the grasp, a straight way back from it, and up
 WAY_M = 0.1
-CODES_PER_UNIT = 24.0  # of log(1 + weighted number of samples), which is 11 at most
+# Of log(1 + weighted number of samples). Codes end at a weight of 34, about four samples in a cell: more of
+# them say how many solutions this arm has, in which arms of other joints differ.
+CODES_PER_UNIT = 72.0
 _REACH_STEP_M = 0.01
 
 

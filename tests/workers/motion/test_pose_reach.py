@@ -43,8 +43,8 @@ def test_poses_that_joints_attain_have_codes_and_far_ones_none(name: str, reach_
     codes = reach_codes(arm, axes, row, xy, turn, rise)
     assert codes.shape == (300, 1, 3)
     assert (codes[:, 0, 0] > 0).mean() > 0.98
-    # Elsewhere around the same bases few of these poses are attained, and beyond the arm none.
-    assert (codes[:, 0, 0] > reach_codes(arm, axes, row, xy, turn, rise + 0.5)[:, 0, 0]).mean() > 0.7
+    # Half a metre higher many of these poses are out of reach.
+    assert reach_codes(arm, axes, row, xy, turn, rise + 0.5)[:, 0, 0].mean() < 0.9 * codes[:, 0, 0].mean()
     assert not reach_codes(arm, axes, row, xy + 5.0, turn, rise).any()
     assert not reach_codes(arm, axes, row, xy, turn, rise - 4.0).any()
     for wrong in (np.nan, np.inf, -1e30):
