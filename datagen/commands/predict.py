@@ -190,6 +190,7 @@ def predict(given: PredictOptions) -> Prediction:
             out=given.out or DEMO_PICTURE,
             html=given.html or DEMO_PAGE,
         )
+    name = given.robot or ""
     given, yaw_rad = (given, 0.0) if given.robot is None else _of_robot(given, given.robot)
     size = (_required(given.base_height, "--base-height"), _required(given.reach, "--reach"))
     outline = None if given.footprint is None else read_footprint(given.footprint)
@@ -206,7 +207,7 @@ def predict(given: PredictOptions) -> Prediction:
     answer = scored(
         load_scorer(scorer) if scorer is None or isinstance(scorer, (str, Path)) else scorer,
         frames,
-        RobotSize(_required(own_height, "--camera-height"), *size, outline, yaw_rad),
+        RobotSize(_required(own_height, "--camera-height"), *size, outline, yaw_rad, name),
         camera_height_m=given.camera_height,
         gravity=direction,
         click=given.click,

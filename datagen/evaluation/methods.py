@@ -26,6 +26,7 @@ from datagen.train.baselines import BASELINES, fit_baselines, make_baselines
 from datagen.train.baselines.baseline import Calibration, calibrate
 from datagen.train.baselines.scalars import Scalars
 from datagen.train.headings import refuse_other_heading, side_deg_of, trained_side_deg
+from datagen.train.run_parts import read_robots
 from datagen.train.scorers import ModelScorer, Scorer, weights_sha256
 from datagen.train.splits import refuse_shared_houses
 from datagen.workers.extras import EXTRAS, how_to_get
@@ -221,8 +222,10 @@ def open_models(paths: Sequence[str], runs: Sequence[EvaluatedRun] = ()) -> list
     found: list[EvaluatedMethod] = []
     for path in paths:
         model, head = load_model(path)
+        other_deg = trained_side_deg(head)
+        if other_deg is None:
+            read_robots(summary.part for run in runs for summary in run.stream.parts)
         for place, spec in ((run.place, spec) for run in runs for spec in run.specs):
-            other_deg = trained_side_deg(head)
             refuse_other_heading(place, "candidates.yaw_rad", side_deg_of(spec), path, other_deg)
         name = RELEASED if path == str(released_checkpoint()) else Path(path).stem
         found.append(EvaluatedMethod(name, ModelScorer(model, name, only_clear=True), path, head))

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
+from datagen.schemas.stored_arrays import facing_rad
 from datagen.train.inputs import (
     F32,
     F64,
@@ -29,7 +30,7 @@ Rows = npt.NDArray[np.intp]
 # Fields of a batch, by table.
 SCENE_FIELDS = ("points_m", "rgb", "target_mask", "n_points", "target_center_m", "target_radius_m")
 ROBOT_FIELDS = ("camera_height_m", "base_height_m", "arm_reach_m")
-SAMPLE_FIELDS = ("sample_id", "robot_index", "base_xy_m", *ROBOT_FIELDS, "label")
+SAMPLE_FIELDS = ("sample_id", "robot_index", "base_xy_m", "base_yaw_rad", *ROBOT_FIELDS, "label")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,7 @@ class StoredScene:
 
     record: Mapping[str, Any]
     samples: Mapping[str, Array]  # (n, ...)
+    robot: str = ""  # of the labels, as in `RobotInputs`
 
     @property
     def words(self) -> tuple[int, ...]:
@@ -64,8 +66,12 @@ def stored_scenes(
     dims: Mapping[str, str],
     bounds: I64,
     rows: I64,
+    robot: str = "",
 ) -> list[StoredScene]:
-    """The scenes of a shard at `rows`. InputError where samples of one robot have different robot values."""
+    """The scenes of a shard at `rows`, with `robot` as in `RobotInputs`.
+
+    InputError where samples of one robot have different robot values.
+    """
     robots = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds)), columns["robot_index"]
     order = np.lexsort(robots[::-1])
     same = (np.diff(robots[0][order]) == 0) & (np.diff(robots[1][order]) == 0)
@@ -87,6 +93,7 @@ def stored_scenes(
         StoredScene(
             {name: a[index] for name, a in scene_columns.items()},
             {name: a[bounds[row] : bounds[row + 1]] for name, a in sample_columns.items()},
+            robot,
         )
         for index, row in zip(indices, rows.tolist(), strict=True)
     ]
@@ -131,6 +138,8 @@ def make_batch(
     new = np.ones(len(scene_row), np.bool_)
     new[1:] = (np.diff(scene_row) != 0) | (np.diff(robot_index) != 0)
     records = [v.scene.record for v in views]
+    of_robots = scene_row[new].astype(np.int64), *(sampled(name)[new] for name in ROBOT_FIELDS)
+    names = np.array([v.scene.robot for v in views], np.str_)
     return Batch(
         clouds=Clouds(
             points_m=np.stack([v.points_m for v in views]),
@@ -140,10 +149,11 @@ def make_batch(
             target_height_m=np.array([r["target_center_m"][2] for r in records], np.float32),
             target_radius_m=np.array([r["target_radius_m"] for r in records], np.float32),
         ),
-        robots=RobotInputs(scene_row[new].astype(np.int64), *(sampled(name)[new] for name in ROBOT_FIELDS)),
+        robots=RobotInputs(*of_robots, name=names[of_robots[0]]),
         candidates=CandidateInputs(
             robot_row=(np.cumsum(new) - 1).astype(np.int64),
             base_xy_m=np.concatenate([v.base_xy_m for v in views]).astype(np.float32),
+            turn_rad=np.concatenate([_turns_rad(v) for v in views]).astype(np.float32),
         ),
         label=sampled("label").astype(np.int64),
         sample_id=sampled("sample_id"),
@@ -152,6 +162,14 @@ def make_batch(
             **{name: sampled(name) for name in extra_sample},
         },
     )
+
+
+def _turns_rad(view: View) -> F64:
+    """Headings (k,) from the directions to the target; they do not change where the scene is rotated."""
+    samples, rows = view.scene.samples, view.rows
+    towards_m = view.scene.record["target_center_m"][:2] - samples["base_xy_m"][rows].astype(np.float64)
+    turn_rad = samples["base_yaw_rad"][rows] - facing_rad(towards_m)
+    return (turn_rad + np.pi) % (2 * np.pi) - np.pi
 
 
 def _native(values: Array) -> Array:

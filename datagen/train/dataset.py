@@ -168,7 +168,7 @@ class SampleStream:
         names = list(dict.fromkeys([*_CORE, *extra, *needs]))
         parts = open_parts(paths, list(dict.fromkeys([*names, *TABLE_FIELDS])), allow_incomplete)
         self._extra = tuple(dict.fromkeys(extra))
-        self._shards = [(s, {n: p.arrays[n] for n in names}) for p in parts for s in p.shards]
+        self._shards = [(s, {n: p.arrays[n] for n in names}, p.robot) for p in parts for s in p.shards]
         self._dims = {name: parts[0].arrays[name].dims[0] for name in names}
         self._scenes = read_scene_table(parts, candidates_per_robot, houses)
         if not 0 <= rank < world:
@@ -275,10 +275,10 @@ class SampleStream:
 
     def _load(self, wanted: tuple[int, I64]) -> dict[int, StoredScene]:
         shard, scenes = wanted
-        place, arrays = self._shards[shard]
+        place, arrays, robot = self._shards[shard]
         columns, bounds = load_shard(place, arrays)
         where = place.url
-        stored = stored_scenes(where, columns, self._dims, bounds, self._scenes.row[scenes])
+        stored = stored_scenes(where, columns, self._dims, bounds, self._scenes.row[scenes], robot)
         return dict(zip(scenes.tolist(), stored, strict=True))
 
     def _batch(self, scenes: Sequence[StoredScene], k: int) -> Batch[Array]:

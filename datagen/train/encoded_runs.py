@@ -31,7 +31,16 @@ from datagen.train.tensors import to_torch
 # Raise it when the same run would give other tokens or columns.
 _VERSION = 3
 # Fields of a model's configuration that decide its tokens.
-_DECISIVE = ("n_points", "tokens", "near_m", "scales_m", "camera", "observed_visibility", "hand_poses")
+_DECISIVE = (
+    "n_points",
+    "tokens",
+    "near_m",
+    "scales_m",
+    "camera",
+    "observed_visibility",
+    "hand_poses",
+    "kinematics",
+)
 _TOKENS, _COLUMNS = "tokens.f16", "columns.npz"
 
 
@@ -89,7 +98,12 @@ class EncodedRuns:
             robots=RobotInputs(
                 cloud_row, c["camera_height_m"][robots], c["base_height_m"][robots], c["arm_reach_m"][robots]
             ),
-            candidates=EncodedCandidates(robot_row, c["base_xy_m"][rows], c["visible_share"][rows]),
+            candidates=EncodedCandidates(
+                robot_row,
+                c["base_xy_m"][rows],
+                c["visible_share"][rows],
+                reach=c["reach"][rows] if "reach" in c else None,
+            ),
             label=c["label"][rows].astype(np.int64),
             sample_id=c["sample_id"][rows],
         )
@@ -143,7 +157,7 @@ def encode_runs(
     The stream is unshuffled and has all candidates. `seen(done, of)` is called while scenes
     are encoded.
     """
-    decisive = {name: model.config[name] for name in _DECISIVE}
+    decisive = {name: model.config[name] for name in _DECISIVE if name in model.config}
     samples = [summary.samples_sha256 for summary in stream.parts]
     key = digest_of({"version": _VERSION, "tokens": decisive, "samples": samples})
     place = folder / key
@@ -186,6 +200,7 @@ def _write(stream: SampleStream, model: SharedModel, place: Path, seen: Callable
                 if model.sizes.observed_visibility:
                     seen_by = (made, given.clouds, given.candidates, given.robots)
                     share = model.visible_share(*seen_by).numpy()
+                reach = model.hand_reach(made, given.candidates, given.robots)
             file.write(tokens.numpy().tobytes())
             poses = made.hand_poses if made.hand_poses is not None else torch.zeros(len(batch.clouds), 0, 0)
             parts.append(_columns(batch, scenes, robots))
@@ -194,6 +209,8 @@ def _write(stream: SampleStream, model: SharedModel, place: Path, seen: Callable
                 "visible_share": share,
                 "hand_poses": poses.half().numpy(),
             }
+            if reach is not None:
+                parts[-1]["reach"] = reach.numpy()
             scenes, robots = scenes + len(batch.clouds), robots + len(batch.robots)
             seen(scenes, stream.n_scenes)
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

@@ -55,6 +55,9 @@ class RobotInputs(Generic[A]):
     camera_height_m: A  # (R,) float32, of the robot's own camera above the floor
     base_height_m: A  # (R,) float32, of the arm's mount above the floor
     arm_reach_m: A  # (R,) float32, d_arm
+    # (R,) text, always numpy: the robot as `open_robot` accepts it, "" for an unknown one. Robots of one
+    # cloud have one name. None: all are unknown.
+    name: Array | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
         return len(self.cloud_row)  # type: ignore[arg-type]
@@ -66,6 +69,8 @@ class CandidateInputs(Generic[A]):
 
     robot_row: A  # (N,) int64, into Robots
     base_xy_m: A  # (N, 2) float32, target frame
+    # (N,) float32: heading from the direction to the target, counter-clockwise. None: bases face the target.
+    turn_rad: A | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
         return len(self.robot_row)  # type: ignore[arg-type]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from datagen.schemas.shard_reading import ShardPlace, StoreFiles, committed_plac
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
 from datagen.schemas.stored_arrays import MAX_META_BYTES, StoredArray, arrays_of, readable, sources_of
+from datagen.workers.robots import remember
 
 _SEALED_FIX = "Seal the run again, and copy the whole data.zarr"
 
@@ -42,6 +43,21 @@ class RunPart:
     sources: tuple[Mapping[str, str], ...]
     attributes: Mapping[str, Any]
     merged: str = ""
+
+    @property
+    def robot(self) -> str:
+        """The robot of its labels as `open_robot` accepts it; "" where labels know no robot."""
+        arm = self.specs[0].arm if self.specs else None  # merged runs have one
+        return "" if arm is None else arm.robot_key
+
+
+def read_robots(parts: Iterable[RunPart]) -> None:
+    """Read the files of robots that runs were made with. InputError where one is missing or has changed."""
+    for part in parts:
+        arm = part.specs[0].arm if part.specs else None
+        if arm is not None and arm.robot_digest is not None:
+            place = part.sources[0].get("robot") if part.sources else None
+            remember(place or arm.robot, arm.robot, arm.robot_digest)
 
 
 def open_parts(

@@ -35,7 +35,7 @@ class ModelScorer:
     """A model's probability of label 1; with `only_clear` 0 where the base is not clear.
 
     `robots` has the least and the largest sizes of the robots that it was trained on, where they are known;
-    `side_deg` is the angle of the target from the front of their bases.
+    `side_deg` is the angle of the target from the front of their bases, None for a model that knows it.
     """
 
     model: Model
@@ -43,7 +43,7 @@ class ModelScorer:
     threshold: float = 0.5
     only_clear: bool = False
     robots: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
-    side_deg: float = 0.0
+    side_deg: float | None = 0.0
 
     def score(self, batch: Batch[Array]) -> F64:
         """Probabilities (N,); the model divides the candidates to bound memory.

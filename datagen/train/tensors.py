@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 def to_torch(batch: Batch[Array], device: torch.device | str) -> Batch[torch.Tensor]:
     """The batch on the device. Text and `sample_id` stay numpy; on the CPU memory is shared."""
-    extra = {name: a if a.dtype.kind in "OUS" else _tensor(a, device) for name, a in batch.extra.items()}
+    extra = {name: _moved_column(a, device) for name, a in batch.extra.items()}
     return Batch(
         clouds=_moved(batch.clouds, device),
         robots=_moved(batch.robots, device),
@@ -26,8 +26,20 @@ def to_torch(batch: Batch[Array], device: torch.device | str) -> Batch[torch.Ten
     )
 
 
+def on_cpu(table: Any) -> Any:
+    """A table of tensors with numpy's arrays."""
+    columns = {f.name: getattr(table, f.name) for f in fields(table)}
+    return replace(table, **{k: a.cpu().numpy() for k, a in columns.items() if isinstance(a, torch.Tensor)})
+
+
 def _moved(table: Any, device: torch.device | str) -> Any:
-    return replace(table, **{f.name: _tensor(getattr(table, f.name), device) for f in fields(table)})
+    columns = {f.name: getattr(table, f.name) for f in fields(table)}
+    moved = {name: _moved_column(a, device) for name, a in columns.items() if a is not None}
+    return replace(table, **moved)
+
+
+def _moved_column(values: Array, device: torch.device | str) -> Any:
+    return values if values.dtype.kind in "OUS" else _tensor(values, device)
 
 
 def _tensor(values: Array, device: torch.device | str) -> torch.Tensor:

@@ -16,8 +16,10 @@ from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.shard_reading import read_scene
+from datagen.train.dataset import SampleStream
 from datagen.train.headings import trained_side_deg
-from datagen.train.training.checkpoints import read_checkpoint
+from datagen.train.scorers import ModelScorer
+from datagen.train.training.checkpoints import load_model, read_checkpoint
 from datagen.workers.bases.clearance import Footprint, base_clearance_m
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.labels.arm_labelling import arm_in_scene
@@ -31,7 +33,7 @@ from tests.small_runs import CONFIG, HERE, PER_SCENE, arrays_of, make_small_run
 from tests.train.prediction.checkpoints import document_of, stored_with, write_untrained
 from tests.train.prediction.seen_scenes import MODEL
 from tests.train.prediction.test_trained_robots import SIZES, origin
-from tests.train.training.small import TINY
+from tests.train.training.small import TINY, equal
 
 OUTLINE = [[0.3, 0.2], [-0.25, 0.2], [-0.25, -0.2], [0.3, -0.2]]
 SAMPLED = CONFIG + "[candidates]\nyaw_rad = {low = -0.5, high = 1.0}\n"
@@ -253,3 +255,53 @@ def test_scenes_of_a_robot_that_faces_the_target_do_not_suit_it(
     refused([*line, robot_file], capsys, "candidates.yaw_rad", "stands at 1.5708 to the target")
     (tmp_path / "wide.toml").write_text(text.replace("[0.3, 0.2]", "[0.6, 0.2]").replace("sideways", "wide"))
     refused([*line, str(tmp_path / "wide.toml")], capsys, "candidates", "wide")
+
+
+@needs_sim
+def test_a_model_that_knows_kinematics_trains_on_robots_that_stand_otherwise(
+    sideways: tuple[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robot_file, run = sideways
+    (tmp_path / "run.toml").write_text(CONFIG + "[arm.grasps]\nper_object = 40\nper_scene = 10\n")
+    ahead = tmp_path / "ahead"
+    line = ["submit", "plan", "--n", "40", "--out", str(ahead), "--robot", "panda", *HERE, "--seed", "2"]
+    more = ["--candidates", "in-range", "--candidates-per-scene", "4", "--config", str(tmp_path / "run.toml")]
+    assert cli.run([*line, *more]) == 0
+    sizes = [f"{name}={value}" for name, value in TINY.items()]
+    line = ["train", "sim-only", str(ahead), str(run), "--epochs", "2", "--device", "cpu", "--threads", "1"]
+    line += [word for size in sizes for word in ("--model-config", size)]
+    words = ("candidates.yaw_rad", "-90 deg", "kinematics=true")
+    refused([*line, "--out", str(tmp_path / "no.ckpt")], capsys, *words)
+    line += ["--model-config", "kinematics=true"]
+    once, again, encoded = (tmp_path / f"{name}.ckpt" for name in ("once", "again", "encoded"))
+    for out, of in ((once, []), (again, []), (encoded, ["--encoded", str(tmp_path / "encoded")])):
+        assert cli.run([*line, "--out", str(out), *of]) == 0
+    first, second, third = (read_checkpoint(out) for out in (once, again, encoded))
+    assert third.head.finished
+    assert first.head.model_config["kinematics"] is True
+    assert equal(first.weights, second.weights)
+
+    def scores(name: str = "") -> np.ndarray:
+        model, _ = load_model(once)
+        (batch,) = SampleStream([run], shuffle=False).epoch(0)
+        robots = replace(batch.robots, name=np.full(len(batch.robots), name)) if name else batch.robots
+        return ModelScorer(model, "model").score(replace(batch, robots=robots))
+
+    # Each batch names its robot and its heading; a scaled arm of that reach scores otherwise.
+    assert np.ptp(scores()) > 1e-4
+    np.testing.assert_array_equal(scores(), scores("panda"))
+    assert np.abs(scores() - scores("panda-scaled")).max() > 1e-6
+    evaluated = ["evaluate", str(once), str(run), "--baselines", "proximity", "--allow-seen-houses"]
+    assert cli.run(evaluated) == 0
+    # Its file is needed again by each of these, and by no other model.
+    moved = Path(robot_file).with_suffix(".moved")
+    Path(robot_file).rename(moved)
+    try:
+        monkeypatch.setattr("datagen.workers.robots._read", {})
+        refused(evaluated, capsys, "sideways.toml")
+        refused([*line, "--out", str(tmp_path / "no.ckpt")], capsys, "sideways.toml")
+    finally:
+        moved.rename(robot_file)

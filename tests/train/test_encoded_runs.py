@@ -18,6 +18,7 @@ from datagen.train.encoded_runs import (
 )
 from datagen.train.models.shared import SharedModel
 from datagen.train.scorers import ModelScorer
+from tests.sim_extra import needs_sim
 from tests.train.models.made_batches import SMALL
 from tests.train.stream_runs import make_stream_run
 
@@ -41,9 +42,12 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> EncodedRuns:
     return encoded(folder / "run", folder / "encodings")
 
 
-def test_a_model_scores_encoded_candidates_as_it_scores_clouds(heuristic_run: Path, tmp_path: Path):
+@pytest.mark.parametrize("kinematics", [False, pytest.param(True, marks=needs_sim)])
+def test_a_model_scores_encoded_candidates_as_it_scores_clouds(
+    kinematics: bool, heuristic_run: Path, tmp_path: Path
+):
     torch.manual_seed(3)
-    model = SharedModel(SMALL_SHARED).eval()
+    model = SharedModel({**SMALL_SHARED, "kinematics": kinematics}).eval()
     stream = encoded_stream([str(heuristic_run)], False)
     data = encode_runs(stream, model, tmp_path, no_progress)
     batches = list(stream.epoch(0))
@@ -53,6 +57,10 @@ def test_a_model_scores_encoded_candidates_as_it_scores_clouds(heuristic_run: Pa
     np.testing.assert_allclose(scores, plain, atol=2e-3)  # tokens have half precision
     assert np.ptp(plain) > 0.01
     np.testing.assert_array_equal(data.label, np.concatenate([batch.label for batch in batches]))
+    plainly = encode_runs(
+        encoded_stream([str(heuristic_run)], False), SharedModel(SMALL_SHARED), tmp_path, no_progress
+    )
+    assert (plainly.key == data.key) is not kinematics
 
 
 def test_trainings_that_encode_the_same_runs_side_by_side_share_them(tmp_path: Path):

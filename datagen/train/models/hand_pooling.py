@@ -15,6 +15,7 @@ from datagen.train.models.hand_poses import N_MEASURES
 from datagen.train.models.tokens import turned
 
 _WRIST_M, _WAY_M = 0.2, 0.1  # from the TCP back to the wrist; before the grasp, and up
+_CODE = 300.0  # of reach: brings its codes near 1
 _NEAR = 0.05  # share of the reach; nearer to the mount a direction is noise
 N_SEEN_FROM_MOUNT = 26
 
@@ -22,10 +23,11 @@ N_SEEN_FROM_MOUNT = 26
 class HandPooling(nn.Module):
     """(N, 3 width) from the poses (S, K, HAND_WIDTH) of clouds: maximum, mean and attention over K."""
 
-    def __init__(self, n_scalars: int, width: int) -> None:
+    def __init__(self, n_scalars: int, width: int, n_reach: int = 0) -> None:
+        """`n_reach` is the number of codes of a robot's own reach (`hand_reach`); 0 without."""
         super().__init__()
         self.room = nn.Sequential(nn.Linear(N_MEASURES, width), nn.ReLU(), nn.Linear(width, width))
-        self.seen = nn.Linear(N_SEEN_FROM_MOUNT, width)
+        self.seen = nn.Linear(N_SEEN_FROM_MOUNT + n_reach, width)
         self.condition = nn.Linear(n_scalars, width)
         self.joined = nn.Sequential(
             nn.LayerNorm(width),
@@ -36,11 +38,18 @@ class HandPooling(nn.Module):
         )
         self.attention = nn.Linear(width, 1)
 
-    def forward(self, poses: Tensor, cloud_row: Tensor, frames: Frames, scalars: Tensor) -> Tensor:
-        """`cloud_row` (N,) has the candidates' clouds, `scalars` (N, n_scalars) their features."""
+    def forward(
+        self, poses: Tensor, cloud_row: Tensor, frames: Frames, scalars: Tensor, reach: Tensor | None = None
+    ) -> Tensor:
+        """`cloud_row` (N,) has the candidates' clouds, `scalars` (N, n_scalars) their features.
+
+        `reach` (N, K, n_reach) are codes.
+        """
         measures, axes = poses[..., :N_MEASURES], poses[..., N_MEASURES:]
         room = self.room(measures)[cloud_row]
         seen = from_mount(axes.unflatten(2, (3, 3))[cloud_row], frames)
+        if reach is not None:
+            seen = torch.cat([seen, reach.to(seen.dtype) / _CODE], dim=-1)
         hidden = self.seen(seen)
         hidden += room
         hidden += self.condition(scalars)[:, None]

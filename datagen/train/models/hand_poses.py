@@ -12,6 +12,7 @@ so that poses turn with the scene.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from math import pi
@@ -20,25 +21,16 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from datagen.train.inputs import F32, F64, U8, Array, Bools, Ints
+from datagen.train.models.hand_size import FRANKA, HandSize
 
-# The Franka Hand's collision shapes (robots' files in workers/robots): other parallel hands are similar.
-_STROKE_M = 0.08
-_PAD_M = 0.011  # half the width of a finger
-_TIP_M = 0.0095  # from the TCP to the fingertips, along the approach
-_FINGER_M = 0.015  # thickness of a finger, along the closing axis
-_PALM_M = (0.033, 0.105)  # half sizes of the palm across the approach
-_PALM_NEAR_M, _PALM_FAR_M = -0.0364, -0.13  # along the approach
-# Centres of the parts' spheres along the approach, and for the palm along the closing axis too.
-_FINGER_Z_M = (-0.045, -0.03, -0.015, 0.0)
-_PALM_YZ_M = tuple((y, z) for z in (-0.066, -0.1) for y in (-0.08, -0.04, 0.0, 0.04, 0.08))
-_WRIST_Z_M = (-0.17, -0.22, -0.28)
-_FINGER_RADIUS_M, _PALM_RADIUS_M, _WRIST_RADIUS_M = 0.009, 0.03, 0.05
+_WRIST_RADIUS_M = 0.05
 _WAYS_M = (0.05, 0.1)  # back along the approach, and up
 
 # Tilts of the approach from straight down, azimuths, and turns of the hand about it.
 _DIRECTIONS = ((0, 1, 8), (20, 4, 4), (45, 8, 4), (70, 8, 4), (95, 8, 2))
 _GRIPS = 6  # positions along the closing axis (middle, both walls) at two depths
 _OPENS_M = 0.02  # how much wider than the target the hand opens
+_PAD_HEIGHT_M = 0.011  # of a pad above the TCP, along the approach
 _SUPPORT_GAP_M = 0.004  # distance kept from the plane that the target stands on
 _TARGET_POINTS, _SHAPE_POINTS = 128, 256
 _NEIGHBOURS = 9
@@ -60,6 +52,7 @@ class _Hands:
     approach: F64  # (P, 3)
     closing: F64  # (P, 3)
     opening_m: F64  # (P,)
+    size: HandSize
 
     @property
     def across(self) -> F64:
@@ -68,32 +61,37 @@ class _Hands:
 
     def fingers(self) -> F64:
         """Spheres (P, 2, 4, 3) of both fingers."""
-        side = (self.opening_m / 2 + _FINGER_M / 2)[:, None, None, None] * np.array([1.0, -1.0])[
+        side = (self.opening_m / 2 + self.size.finger_m / 2)[:, None, None, None] * np.array([1.0, -1.0])[
             :, None, None
         ]
-        z = np.array(_FINGER_Z_M)[:, None] * self.approach[:, None, None]
+        z = np.array(self.size.finger_z_m)[:, None] * self.approach[:, None, None]
         return self.tcp_m[:, None, None] + side * self.closing[:, None, None] + z
 
     def palm(self) -> F64:
         """Spheres (P, 10, 3) of the palm."""
-        y, z = np.array(_PALM_YZ_M).T[..., None]
+        y, z = np.array(self.size.palm_yz_m).T[..., None]
         return self.tcp_m[:, None] + y * self.closing[:, None] + z * self.approach[:, None]
 
     def wrist(self) -> F64:
         """Spheres (P, 3, 3) of the wrist, which carries the hand."""
-        return self.tcp_m[:, None] + np.array(_WRIST_Z_M)[:, None] * self.approach[:, None]
+        return self.tcp_m[:, None] + np.array(self.size.wrist_z_m)[:, None] * self.approach[:, None]
 
 
-def poses_of_clouds(points_m: F32, target_mask: Bools, n_points: Ints, count: int) -> F32:
-    """`hand_poses` (S, count, HAND_WIDTH) of clouds (S, P, 3) with `n_points` (S,) valid first points."""
+def poses_of_clouds(
+    points_m: F32, target_mask: Bools, n_points: Ints, count: int, hands: Sequence[HandSize] = ()
+) -> F32:
+    """`hand_poses` (S, count, HAND_WIDTH) of clouds (S, P, 3) with `n_points` (S,) valid first points.
+
+    `hands` has each cloud's hand; without, all are Franka Hands.
+    """
     found = np.zeros((len(n_points), count, HAND_WIDTH), np.float32)
     for row, n in enumerate(n_points):
         cloud_m, mask = points_m[row, :n], target_mask[row, :n]
-        found[row] = hand_poses(cloud_m[~mask], cloud_m[mask], count)
+        found[row] = hand_poses(cloud_m[~mask], cloud_m[mask], count, hands[row] if hands else FRANKA)
     return found
 
 
-def hand_poses(others_m: F32, target_m: F32, count: int) -> F32:
+def hand_poses(others_m: F32, target_m: F32, count: int, size: HandSize = FRANKA) -> F32:
     """The `count` most promising poses (count, HAND_WIDTH), best first: measures, TCP, approach, closing.
 
     Points of other objects (M, 3) and of the target (T, 3) are in the target's frame, as are the poses. Rows
@@ -111,14 +109,14 @@ def hand_poses(others_m: F32, target_m: F32, count: int) -> F32:
     angle = float(np.arctan2(seen_from[1], seen_from[0])) if np.hypot(*seen_from) > 1e-4 else 0.0
     c, s = np.cos(angle), np.sin(angle)
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])  # from the frame in which the target is seen from +x
-    measures, penalty, hands = _measured(others @ R, target @ R)
+    measures, penalty, hands = _measured(others @ R, target @ R, size)
     best = np.argsort(penalty, kind="stable")[:count]
     axes = [v[best] @ R.T for v in (hands.tcp_m, hands.approach, hands.closing)]
     found[: len(best)] = np.concatenate([measures[best], *axes], axis=1)
     return found
 
 
-def _measured(others_m: F64, target_m: F64) -> tuple[F64, F64, _Hands]:
+def _measured(others_m: F64, target_m: F64, size: HandSize) -> tuple[F64, F64, _Hands]:
     """Measures (D, N_MEASURES), penalties (D,) and poses of the best grip of each direction."""
     turned = np.array([-1.0, -1.0, 1.0])
     half = target_m[:_TARGET_POINTS]
@@ -129,11 +127,12 @@ def _measured(others_m: F64, target_m: F64) -> tuple[F64, F64, _Hands]:
     frames = _frames()  # (D, 3 axes, 3)
     local = np.einsum("dij,nj->din", frames, points)
     facing = np.abs(frames[:, 1] @ normals.T)
-    grips, low, high = _grips(local, frames[:, :, 2], support_m)
+    grips, low, high = _grips(local, frames[:, :, 2], support_m, size)
 
     offset = local[:, None] - grips[..., None]  # (D, 6, 3, N)
     x, y, z = offset[:, :, 0], offset[:, :, 1], offset[:, :, 2]
-    between = (np.abs(x) < _PAD_M) & (z > -0.014) & (z < _PAD_M) & (np.abs(y) < 0.043)
+    between = (np.abs(x) < size.pad_m) & (z > -0.014) & (z < _PAD_HEIGHT_M)
+    between &= np.abs(y) < round(size.stroke_m / 2 + 0.003, 6)
     held = between.sum(-1)
     spread = (np.abs(y) * between).max(-1) * 2
     width = np.maximum(np.where(between, y, -9).max(-1) - np.where(between, y, 9).min(-1), 0)
@@ -143,10 +142,10 @@ def _measured(others_m: F64, target_m: F64) -> tuple[F64, F64, _Hands]:
 
     tcp = np.einsum("dij,dki->dkj", frames, grips).reshape(-1, 3)
     axes = np.repeat(frames, _GRIPS, axis=0)
-    opening = np.minimum(spread + _OPENS_M, _STROKE_M).ravel()
-    hands = _Hands(tcp, axes[:, 2], axes[:, 1], opening)
+    opening = np.minimum(spread + _OPENS_M, size.stroke_m).ravel()
+    hands = _Hands(tcp, axes[:, 2], axes[:, 1], opening, size)
     clear, own = _clearances(hands, others_m, whole)
-    tips, palm = (h - support_m for h in _lowest(tcp[:, 2], axes[:, :, 2], opening))
+    tips, palm = (h - support_m for h in _lowest(tcp[:, 2], axes[:, :, 2], opening, size))
 
     extent = np.repeat(high - low, _GRIPS, axis=0)  # (P, 3)
     numbers = [np.log1p(held.ravel()) / 3, 10 * width.ravel(), 10 * opening]
@@ -160,12 +159,14 @@ def _measured(others_m: F64, target_m: F64) -> tuple[F64, F64, _Hands]:
     def short(gap: F64) -> F64:
         return np.maximum(0.005 - gap, 0) * 40
 
-    penalty = 2.0 * (held.ravel() < 3) + 3.0 * (width.ravel() > 0.078) + 1 - squareness.ravel()
+    penalty = (
+        2.0 * (held.ravel() < 3) + 3.0 * (width.ravel() > size.stroke_m - 0.002) + 1 - squareness.ravel()
+    )
     weights = (1.5, 1.5, 1.5, 0.5, 0.7, 0.7, 0.7, 0.7, 0.4, 0.4)
     penalty += sum(w * short(gap) for w, gap in zip(weights, clear, strict=True))
     penalty += short(own[0] + 0.004) + short(own[1]) + 2 * short(tips + 0.002) + 2 * short(palm + 0.002)
     best = np.arange(len(frames)) * _GRIPS + penalty.reshape(-1, _GRIPS).argmin(1)
-    chosen = _Hands(hands.tcp_m[best], hands.approach[best], hands.closing[best], opening[best])
+    chosen = _Hands(hands.tcp_m[best], hands.approach[best], hands.closing[best], opening[best], size)
     return np.stack(numbers, axis=1)[best], penalty[best], chosen
 
 
@@ -185,7 +186,7 @@ def _frames() -> F64:
     return np.array(frames)
 
 
-def _grips(local: F64, rise: F64, support_m: float) -> tuple[F64, F64, F64]:
+def _grips(local: F64, rise: F64, support_m: float, size: HandSize) -> tuple[F64, F64, F64]:
     """TCPs (D, 6, 3) in each direction's own axes, and the target's bounds (D, 3) there.
 
     `local` (D, 3, N) are the target's points, `rise` (D, 3) is the height gained along each axis.
@@ -195,7 +196,7 @@ def _grips(local: F64, rise: F64, support_m: float) -> tuple[F64, F64, F64]:
     low, high = local.min(2), local.max(2)
     positions = np.stack([(low[:, 1] + high[:, 1]) / 2, low[:, 1] + 0.004, high[:, 1] - 0.004], axis=1)
     across, up = rise[:, :1], rise[:, 2:]
-    opening = np.minimum(high[:, 1:2] - low[:, 1:2] + _OPENS_M, _STROKE_M)
+    opening = np.minimum(high[:, 1:2] - low[:, 1:2] + _OPENS_M, size.stroke_m)
     deep = np.minimum(low[:, 2] + 0.032, (low[:, 2] + high[:, 2]) / 2 + 0.004)
     grips: list[F64] = []
     for depth in (low[:, 2] + 0.008, deep):
@@ -204,7 +205,7 @@ def _grips(local: F64, rise: F64, support_m: float) -> tuple[F64, F64, F64]:
 
         def missing(x: F64, z: F64) -> F64:
             height = across * x + rise[:, 1:2] * positions + up * z
-            lowest = np.minimum(*_lowest(height, rise[:, None], opening))
+            lowest = np.minimum(*_lowest(height, rise[:, None], opening, size))
             return np.maximum(_SUPPORT_GAP_M - (lowest - support_m), 0)
 
         back = np.where(up < -0.3, missing(x, z) / np.maximum(-up, 0.3), 0)
@@ -219,14 +220,14 @@ def _grips(local: F64, rise: F64, support_m: float) -> tuple[F64, F64, F64]:
     return np.concatenate(grips, axis=1), low, high
 
 
-def _lowest(tcp_height_m: F64, rise: F64, opening_m: F64) -> tuple[F64, F64]:
+def _lowest(tcp_height_m: F64, rise: F64, opening_m: F64, size: HandSize) -> tuple[F64, F64]:
     """Heights of the lowest corner of the fingertips and of the palm; `rise` (..., 3) as in `_grips`."""
     across, closing = np.abs(rise[..., 0]), np.abs(rise[..., 1])
     approach = rise[..., 2]
-    tips = tcp_height_m - np.maximum(-approach * _TIP_M, 0) - across * 0.009
-    tips = tips - closing * (opening_m / 2 + _FINGER_M)
-    palm = tcp_height_m + np.minimum(approach * _PALM_NEAR_M, approach * _PALM_FAR_M)
-    return tips, palm - across * _PALM_M[0] - closing * _PALM_M[1]
+    tips = tcp_height_m - np.maximum(-approach * size.tip_m, 0) - across * 0.009
+    tips = tips - closing * (opening_m / 2 + size.finger_m)
+    palm = tcp_height_m + np.minimum(approach * size.palm_near_m, approach * size.palm_far_m)
+    return tips, palm - across * size.palm_m[0] - closing * size.palm_m[1]
 
 
 def _clearances(hands: _Hands, others_m: F64, target_m: F64) -> tuple[list[F64], list[F64]]:
@@ -236,20 +237,21 @@ def _clearances(hands: _Hands, others_m: F64, target_m: F64) -> tuple[list[F64],
     all at two positions on the way up. From the target: fingers, palm.
     """
     fingers, palm, wrist = hands.fingers(), hands.palm(), hands.wrist()
+    finger_m, palm_m = hands.size.finger_radius_m, hands.size.palm_radius_m
     others = partial(_around(others_m, _AROUND_M, _CELL_M), outside_m=_BEYOND_M)
     own = partial(_around(target_m, _TARGET_AROUND_M, _TARGET_CELL_M), outside_m=_BEYOND_M)
-    each = others(fingers).min(2) - _FINGER_RADIUS_M
-    clear = [each.min(1), each.max(1), others(palm).min(1) - _PALM_RADIUS_M]
+    each = others(fingers).min(2) - finger_m
+    clear = [each.min(1), each.max(1), others(palm).min(1) - palm_m]
     clear.append(others(wrist).min(1) - _WRIST_RADIUS_M)
     both, up = fingers.reshape(len(palm), -1, 3), np.array([0.0, 0.0, 1.0])
     for way in _WAYS_M:
         back = -way * hands.approach[:, None]
-        clear.append(others(both + back).min(1) - _FINGER_RADIUS_M)
-        clear.append(others(palm + back).min(1) - _PALM_RADIUS_M)
+        clear.append(others(both + back).min(1) - finger_m)
+        clear.append(others(palm + back).min(1) - palm_m)
     for way in _WAYS_M:
-        raised = others(both + way * up).min(1) - _FINGER_RADIUS_M
-        clear.append(np.minimum(raised, others(palm + way * up).min(1) - _PALM_RADIUS_M))
-    return clear, [own(both).min(1) - _FINGER_RADIUS_M, own(palm).min(1) - _PALM_RADIUS_M]
+        raised = others(both + way * up).min(1) - finger_m
+        clear.append(np.minimum(raised, others(palm + way * up).min(1) - palm_m))
+    return clear, [own(both).min(1) - finger_m, own(palm).min(1) - palm_m]
 
 
 def _around(points_m: F64, half_m: float, cell_m: float) -> DistanceGrid:

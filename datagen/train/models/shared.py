@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from datagen.train.inputs import CandidateInputs, Clouds, RobotInputs
@@ -37,7 +37,9 @@ from datagen.train.models.frames import (
 )
 from datagen.train.models.hand_pooling import HandPooling
 from datagen.train.models.hand_poses import poses_of_clouds
+from datagen.train.models.hand_reach import N_STAGES, hand_reach, hands_of
 from datagen.train.models.model import Model, ModelConfig, read_config
+from datagen.train.models.tiles import tiles
 from datagen.train.models.tokens import (
     N_KINDS,
     TARGET_NUMBERS,
@@ -52,6 +54,7 @@ from datagen.train.models.tokens import (
     unpack,
 )
 from datagen.train.observed_visibility import visible_shares
+from datagen.train.tensors import on_cpu
 
 # Candidates in one product: on a CPU their tokens stay in a core's cache.
 _TILE_CPU, _TILE_CUDA = 64, 4096
@@ -73,6 +76,7 @@ class SharedConfig(ModelConfig):
     `camera`: "given", or "unknown" as for `paper`, which has the height of the mount and not of the camera.
     `observed_visibility`: add rho, estimated on the CPU from the robot's crop. `hand_poses`: number of poses
     of a hand at the target (`hand_poses.py`); 0 for none. `mirrored`: treat left and right alike.
+    `kinematics`: poses of the robot's own hand, and how easily its own arm brings it there (`hand_reach.py`).
     """
 
     n_points: int = Field(default=1024, ge=1, le=65_536)
@@ -87,6 +91,13 @@ class SharedConfig(ModelConfig):
     observed_visibility: bool = True
     hand_poses: int = Field(default=64, ge=0, le=104)  # at the target; 0 for none
     mirrored: bool = True
+    kinematics: bool = False
+
+    @model_validator(mode="after")
+    def _has_poses(self) -> SharedConfig:
+        if self.kinematics and not self.hand_poses:
+            raise ValueError("kinematics needs hand_poses")
+        return self
 
 
 def mlp(width_in: int, widths: Sequence[int], width_out: int) -> nn.Sequential:
@@ -106,6 +117,8 @@ class SharedModel(Model):
     def __init__(self, config: Mapping[str, Any]) -> None:
         self.sizes = read_config(SharedConfig, self.name, config)
         super().__init__(self.sizes)
+        if not self.sizes.kinematics:  # checkpoints of before this field stay equal to those of today
+            del self.config["kinematics"]
         width, embedding = self.sizes.width, self.sizes.embedding
         token = token_sizes(len(self.sizes.scales_m))
         n_scalars = N_SCALARS + TARGET_NUMBERS + 2 * (TARGET_VECTORS + TARGET_TENSORS)
@@ -132,7 +145,7 @@ class SharedModel(Model):
         self.scalars = nn.Sequential(nn.Linear(n_scalars, 64), nn.ReLU(), nn.Linear(64, embedding))
         joined = 2 * embedding
         if self.sizes.hand_poses:
-            self.hands = HandPooling(n_scalars, width)
+            self.hands = HandPooling(n_scalars, width, N_STAGES * self.sizes.kinematics)
             joined += 3 * width
         self.head = nn.Sequential(
             nn.LayerNorm(joined),
@@ -169,7 +182,8 @@ class SharedModel(Model):
         points, mask, count = (
             t.cpu().numpy() for t in (clouds.points_m, clouds.target_mask, clouds.n_points)
         )
-        poses = torch.from_numpy(poses_of_clouds(points, mask, count, self.sizes.hand_poses))
+        hands = hands_of(on_cpu(robots), len(clouds)) if self.sizes.kinematics else ()
+        poses = torch.from_numpy(poses_of_clouds(points, mask, count, self.sizes.hand_poses, hands))
         return replace(tokens, hand_poses=poses.to(clouds.points_m.device))
 
     def score_tokens(
@@ -209,9 +223,11 @@ class SharedModel(Model):
         if tokens.hand_poses is not None and self.sizes.hand_poses:
             cloud_row = robots.cloud_row[candidates.robot_row]
             some = torch.arange(len(candidates), device=scalars.device).split(size)
+            reach = self.hand_reach(tokens, candidates, robots)
+            codes = [None] * len(some) if reach is None else reach.split(size)
             of_tiles = [
-                self.hands(tokens.hand_poses, cloud_row[rows], take_rows(frames, rows), scalars[rows])
-                for rows in some
+                self.hands(tokens.hand_poses, cloud_row[rows], take_rows(frames, rows), scalars[rows], of)
+                for rows, of in zip(some, codes, strict=True)
             ]
             joined.append(torch.cat(of_tiles))
         return self.head(torch.cat(joined, dim=1)).float()
@@ -232,6 +248,21 @@ class SharedModel(Model):
         inputs = (target_frame_points(crop), crop.target_mask, crop.valid, tokens.target_radius_m)
         rho = visible_shares(*(t.cpu().numpy() for t in (*inputs, candidates.robot_row, eyes_m)))
         return torch.from_numpy(rho.astype(np.float32)).to(candidates.base_xy_m.device)
+
+    def hand_reach(
+        self, tokens: Tokens, candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
+    ) -> Tensor | None:
+        """Codes (N, K, N_STAGES) of the hand poses, on the CPU; those of `EncodedCandidates` as they are.
+
+        None without `kinematics`. Raises InputError where a robot's files are missing.
+        """
+        if not self.sizes.kinematics or tokens.hand_poses is None:
+            return None
+        if isinstance(candidates, EncodedCandidates):
+            return candidates.reach
+        poses, rise_m = (t.cpu().numpy() for t in (tokens.hand_poses, tokens.target_rise_m))
+        codes = hand_reach(poses, on_cpu(robots), on_cpu(candidates), rise_m)
+        return torch.from_numpy(codes).to(candidates.base_xy_m.device)
 
     def _frames(
         self,
@@ -305,28 +336,6 @@ class SharedModel(Model):
             n = mask.sum(1).clamp(min=1)[:, None, None]
             parts += [of_kind.amax(2), of_kind.sum(2) / n]
         return torch.cat(parts, dim=2)
-
-
-def tiles(robot_row: Tensor, size: int) -> list[tuple[Tensor, Tensor]]:
-    """Robots (r,) and rows (r, c) of candidates of each, r c <= size; together they hold every row once.
-
-    `robot_row` (N,) has the candidates' robots. A robot's rows are cut into pieces of at most `size`, and
-    pieces of equal length are joined, without padding.
-    """
-    order = torch.argsort(robot_row, stable=True)
-    robots, counts = torch.unique_consecutive(robot_row[order], return_counts=True)
-    pieces: dict[int, list[tuple[int, Tensor]]] = {}
-    for robot, rows in zip(robots.tolist(), order.split(counts.tolist()), strict=True):
-        for piece in rows.split(size):
-            pieces.setdefault(len(piece), []).append((robot, piece))
-    cut: list[tuple[Tensor, Tensor]] = []
-    for length, equal in pieces.items():
-        together = size // length
-        for start in range(0, len(equal), together):
-            some = equal[start : start + together]
-            chosen = torch.tensor([robot for robot, _ in some], device=robot_row.device)
-            cut.append((chosen, torch.stack([rows for _, rows in some])))
-    return cut
 
 
 def _product(steering: Tensor, of_tokens: Tensor) -> Tensor:

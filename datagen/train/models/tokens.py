@@ -9,7 +9,7 @@ target numbers are invariant too, and components to the left change their sign.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import torch
@@ -203,6 +203,7 @@ class EncodedCandidates(CandidateInputs[A]):
     """N base positions with the estimated visibility of the target."""
 
     visible_share: A  # (N,) float32
+    reach: A | None = field(default=None, kw_only=True)  # (N, K, N_STAGES) uint8 of `hand_reach`
 
 
 def pack(tokens: Tokens) -> tuple[Tensor, Tensor]:

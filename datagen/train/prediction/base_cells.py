@@ -42,6 +42,7 @@ class RobotSize:
     arm_reach_m: float
     footprint: Footprint | None = None  # None: the circular base of such an arm in runs
     yaw_rad: float = 0.0  # heading of the base relative to the direction to the target
+    name: str = ""  # as `open_robot` accepts it; "" for an unknown robot
 
     @property
     def outline(self) -> Footprint:

@@ -311,8 +311,11 @@ def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, cells: BaseCells) 
             one(robot.camera_height_m),
             one(robot.base_height_m),
             one(robot.arm_reach_m),
+            name=np.array([robot.name], np.str_),
         ),
-        CandidateInputs(np.zeros(n, np.int64), cells.offset_m),
+        CandidateInputs(
+            np.zeros(n, np.int64), cells.offset_m, turn_rad=np.full(n, robot.yaw_rad, np.float32)
+        ),
         np.zeros(n, np.int64),
         np.zeros((n, 16), np.uint8),
         {"base_is_clear": cells.state != STATES.index(BLOCKED)},

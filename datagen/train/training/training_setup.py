@@ -17,11 +17,11 @@ from datagen.schemas.errors import InputError
 from datagen.train.augment import Augmentation
 from datagen.train.dataset import SampleStream
 from datagen.train.encoded_runs import EncodedBatches, encode_runs, encoded_stream
-from datagen.train.headings import refuse_mixed_headings
+from datagen.train.headings import knows_headings, refuse_mixed_headings
 from datagen.train.models import Model, build_model
 from datagen.train.models.shared import SharedModel
 from datagen.train.rates import rate_fields
-from datagen.train.run_parts import open_parts, refuse_mixed_labels
+from datagen.train.run_parts import open_parts, read_robots, refuse_mixed_labels
 from datagen.train.splits import HouseShare, refuse_one_class, refuse_shared_houses, split_by_house
 from datagen.train.training.checkpoints import (
     Checkpoint,
@@ -167,7 +167,10 @@ def _streams(job: TrainingJob) -> tuple[SampleStream, SampleStream]:
     parts = [summary.part for stream in (train, val) for summary in stream.parts]
     named = [(part.place, spec) for part in parts for spec in part.specs]
     refuse_mixed_labels(named)
-    refuse_mixed_headings(named)
+    if knows_headings(options.model, options.model_config):
+        read_robots(parts)
+    else:
+        refuse_mixed_headings(named)
     refuse_shared_houses(train, val)
     return train, val
 

@@ -18,8 +18,8 @@ from datagen.workers.kinematics.compiler import compiled, in_memory, struct
 from datagen.workers.kinematics.inverse import joint_poses, one_turn, tcp_pose
 from datagen.workers.kinematics.tree import Ints, KinematicTree
 
-_DISTANCES, _HEIGHTS, _SIDES, _ROLLS, _AZIMUTHS = 16, 32, 3, 8, 12
-_DIRECTIONS = 6 * _SIDES * _SIDES  # cells on the faces of a cube
+DISTANCES, HEIGHTS, _SIDES, ROLLS, AZIMUTHS = 16, 32, 3, 8, 12
+DIRECTIONS = 6 * _SIDES * _SIDES  # cells on the faces of a cube
 _SAMPLES = 1 << 19  # joint vectors of a map
 _FIRST_SAMPLES = 1 << 14  # those that decide how far it extends
 _DIGITS = 6  # of an arm's numbers, in units of its length: scaled copies of an arm share samples
@@ -68,10 +68,10 @@ def reach_workspace(coordinates: int) -> ReachWork:
 
 
 @compiled
-def _cell(distance: float, height: float, azimuth: float, a: F64, c: F64, turns: bool) -> int:
+def cell_of(distance: float, height: float, azimuth: float, a: F64, c: F64, turns: bool) -> int:
     """The cell of a hand at a distance and height (-1 to 1), with approach a and closing axis c, (3,)."""
-    i = min(int(distance * _DISTANCES), _DISTANCES - 1)
-    k = min(max(int((height + 1) / 2 * _HEIGHTS), 0), _HEIGHTS - 1)
+    i = min(int(distance * DISTANCES), DISTANCES - 1)
+    k = min(max(int((height + 1) / 2 * HEIGHTS), 0), HEIGHTS - 1)
     face, largest = 0, abs(a[0])
     for n in range(1, 3):
         if abs(a[n]) > largest:
@@ -89,11 +89,11 @@ def _cell(distance: float, height: float, azimuth: float, a: F64, c: F64, turns:
     x, y, z = ex - dot * a[0], ey - dot * a[1], -dot * a[2]
     px, py, pz = a[1] * z - a[2] * y, a[2] * x - a[0] * z, a[0] * y - a[1] * x
     roll = math.atan2(c[0] * px + c[1] * py + c[2] * pz, c[0] * x + c[1] * y + c[2] * z)
-    r = min(int((roll / (2 * math.pi) + 0.5) * _ROLLS), _ROLLS - 1)
-    at = ((i * _HEIGHTS + k) * _DIRECTIONS + (face * _SIDES + m) * _SIDES + n) * _ROLLS + r
+    r = min(int((roll / (2 * math.pi) + 0.5) * ROLLS), ROLLS - 1)
+    at = ((i * HEIGHTS + k) * DIRECTIONS + (face * _SIDES + m) * _SIDES + n) * ROLLS + r
     if turns:
         return at
-    return at * _AZIMUTHS + min(int((azimuth / (2 * math.pi) + 0.5) * _AZIMUTHS), _AZIMUTHS - 1)
+    return at * AZIMUTHS + min(int((azimuth / (2 * math.pi) + 0.5) * AZIMUTHS), AZIMUTHS - 1)
 
 
 @compiled
@@ -126,23 +126,23 @@ def cells_near(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> float:
     for k in range(7):
         cells[k] = -1
     distance, height = feature[0], feature[1]
-    if distance > 1 + 1 / _DISTANCES or abs(height) > 1 + 2 / _HEIGHTS:
+    if distance > 1 + 1 / DISTANCES or abs(height) > 1 + 2 / HEIGHTS:
         return azimuth
     a, c = feature[2:5], feature[5:8]
-    cells[0] = _cell(distance, height, azimuth, a, c, turns)
-    step = _ROLLS * _DIRECTIONS * (1 if turns else _AZIMUTHS)
-    per = 1 if turns else _AZIMUTHS
-    i, k, r = cells[0] // (step * _HEIGHTS), cells[0] // step % _HEIGHTS, cells[0] // per % _ROLLS
+    cells[0] = cell_of(distance, height, azimuth, a, c, turns)
+    step = ROLLS * DIRECTIONS * (1 if turns else AZIMUTHS)
+    per = 1 if turns else AZIMUTHS
+    i, k, r = cells[0] // (step * HEIGHTS), cells[0] // step % HEIGHTS, cells[0] // per % ROLLS
     if i > 0:
-        cells[1] = cells[0] - step * _HEIGHTS
-    if i < _DISTANCES - 1:
-        cells[2] = cells[0] + step * _HEIGHTS
+        cells[1] = cells[0] - step * HEIGHTS
+    if i < DISTANCES - 1:
+        cells[2] = cells[0] + step * HEIGHTS
     if k > 0:
         cells[3] = cells[0] - step
-    if k < _HEIGHTS - 1:
+    if k < HEIGHTS - 1:
         cells[4] = cells[0] + step
-    cells[5] = cells[0] + per * ((r + 1) % _ROLLS - r)
-    cells[6] = cells[0] + per * ((r - 1) % _ROLLS - r)
+    cells[5] = cells[0] + per * ((r + 1) % ROLLS - r)
+    cells[6] = cells[0] + per * ((r - 1) % ROLLS - r)
     return azimuth
 
 
@@ -207,13 +207,13 @@ def _fill(reach: ReachMap, tree: KinematicTree, q: F64, cell: Ints, features: F6
         tcp_pose(tree, root, joints, T)
         f = features[k]
         azimuth = _feature(reach, T, f)
-        cell[k] = _cell(f[0], f[1], azimuth, f[2:5], f[5:8], reach.turn >= 0)
+        cell[k] = cell_of(f[0], f[1], azimuth, f[2:5], f[5:8], reach.turn >= 0)
         if reach.turn >= 0:
             q[k, reach.turn] -= azimuth
 
 
 def reach_map(tree: KinematicTree, draw: int = 0) -> ReachMap:
-    """Where the tree's hand can be. Trees that differ by their scale alone share the samples.
+    """Where the hand of a tree, whose axes are z, can be. Trees that differ by scale alone share samples.
 
     `draw` seeds the samples.
     """
@@ -269,7 +269,7 @@ def _samples(one: KinematicTree, turn: int, axis_xy: F64, draw: int) -> tuple[I3
     half = 1.02 * float(np.abs(features[: len(some), :2]).max())
     _fill(in_memory(reach._replace(half_m=half)), tree, q, cell, features)
     order = np.argsort(cell, kind="stable")
-    count = _DISTANCES * _HEIGHTS * _DIRECTIONS * _ROLLS * (1 if turn >= 0 else _AZIMUTHS)
+    count = DISTANCES * HEIGHTS * DIRECTIONS * ROLLS * (1 if turn >= 0 else AZIMUTHS)
     first = np.searchsorted(cell[order], np.arange(count + 1)).astype(np.int32)
     return first, q[order].astype(np.float32), half
 

@@ -17,6 +17,7 @@ import datagen.workers.robots
 from datagen import cli
 from tests.datagen.predict.frames import arguments, frame_with
 from tests.refusals import refused
+from tests.sim_extra import needs_robots
 from tests.small_runs import json_of
 from tests.train.prediction.checkpoints import document_of, stored_with, write_untrained
 from tests.train.prediction.seen_scenes import MODEL
@@ -131,6 +132,28 @@ def test_a_robots_file_gives_its_sizes_and_the_heading_of_its_side(
     assert own["robot"]["base_height_m"] == 0.8
     refused(arguments(made, "--robot", "hal"), capsys, "--robot", "hal", "panda")
     refused(arguments(made, "--robot", "panda-scaled", drop=("--reach",)), capsys, "--reach", "missing")
+
+
+@needs_robots
+def test_a_model_that_knows_kinematics_scores_the_named_robot(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_untrained(tmp_path / "model.ckpt", MODEL | {"kinematics": True})
+    panda = (Path(datagen.workers.robots.__file__).parent / "panda.toml").read_text()
+    base = "footprint_m = [[0.3, 0.1], [-0.3, 0.1], [-0.3, -0.1], [0.3, -0.1]]\nheight_m = 0.7\n"
+    aside = panda.replace("pedestal = true\n", base + 'presents = "side"\nside_deg = 150\n')
+    (tmp_path / "aside.toml").write_text(aside)
+
+    def scores(*robot: str) -> list[float]:
+        line = arguments(made, "--footprint", "0.3", *robot)
+        answer = json_of(capsys, [line[0], str(tmp_path / "model.ckpt"), *line[2:]])
+        return [each["score"] for each in answer["candidates"]]
+
+    unnamed = scores()
+    assert scores("--robot", "panda-scaled") == unnamed
+    named = [scores("--robot", robot) for robot in ("panda", "ur5", "fetch", str(tmp_path / "aside.toml"))]
+    assert all(np.abs(np.subtract(other, unnamed)).max() > 1e-6 for other in named)
+    assert len({tuple(each) for each in named}) == len(named)
 
 
 def test_a_frame_without_a_clear_place_ends_with_1(made: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,65 @@
+"""How easily an arm reaches poses: what its joints attain counts, what is too far does not, both rolls do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datagen.workers.motion.pose_reach import pose_reach, reach_codes
+from datagen.workers.robots import open_largest, open_robot
+from tests.sim_extra import needs_robots, needs_sim
+
+# An arm with axes along y, one without an upright first joint, and one whose base turns.
+ROBOTS = [
+    pytest.param("panda-scaled", 0.6, marks=needs_sim),
+    pytest.param("panda-scaled", 0.95, marks=needs_sim),
+    *(pytest.param(name, None, marks=needs_robots) for name in ("ur5", "tiago-pro", "stretch3")),
+]
+
+
+def attained(name: str, reach_m: float | None, count: int) -> tuple[np.ndarray, ...]:
+    """Poses (count, 1, 3, 3) that random joints attain, and bases: xy, turn, rise of the target."""
+    robot = open_largest(name) if reach_m is None else open_robot(name, reach_m, 0.5)
+    rng = np.random.default_rng(0)
+    low, high = np.maximum(robot.q_lower_rad, -np.pi), np.minimum(robot.q_upper_rad, np.pi)
+    T = np.stack([robot.T_base_tcp(rng.uniform(low, high)) for _ in range(count)])
+    # The target is where the TCP is, the base anywhere around it, with any heading.
+    yaw_rad = rng.uniform(-np.pi, np.pi, count)
+    c, s, zero = np.cos(yaw_rad), np.sin(yaw_rad), np.zeros(count)
+    R = np.stack(
+        [np.stack([c, -s, zero], 1), np.stack([s, c, zero], 1), np.stack([zero, zero, zero + 1], 1)], 1
+    )
+    xy = -np.einsum("nij,nj->ni", R, T[:, :3, 3])[:, :2]
+    axes = np.stack(
+        [np.zeros((count, 3)), *(np.einsum("nij,nj->ni", R, T[:, :3, k]) for k in (2, 1))], axis=1
+    )
+    return axes[:, None], xy, yaw_rad - np.arctan2(-xy[:, 1], -xy[:, 0]), T[:, 2, 3]
+
+
+@pytest.mark.parametrize(("name", "reach_m"), ROBOTS)
+def test_poses_that_joints_attain_have_codes_and_far_ones_none(name: str, reach_m: float | None) -> None:
+    axes, xy, turn, rise = attained(name, reach_m, 300)
+    arm, row = pose_reach(name, reach_m or 1.0), np.arange(300)
+    codes = reach_codes(arm, axes, row, xy, turn, rise)
+    assert codes.shape == (300, 1, 3)
+    assert (codes[:, 0, 0] > 0).mean() > 0.98
+    # Half a metre higher many of these poses are out of reach.
+    assert reach_codes(arm, axes, row, xy, turn, rise + 0.5)[:, 0, 0].mean() < 0.9 * codes[:, 0, 0].mean()
+    assert not reach_codes(arm, axes, row, xy + 5.0, turn, rise).any()
+    assert not reach_codes(arm, axes, row, xy, turn, rise - 4.0).any()
+    for wrong in (np.nan, np.inf, -1e30):
+        assert not reach_codes(arm, axes, row, np.full_like(xy, wrong), turn, rise).any()
+        assert not reach_codes(arm, axes, row, xy, turn, np.full_like(rise, wrong)).any()
+    assert not reach_codes(arm, axes, row, xy, np.full_like(turn, np.nan), rise).any()
+    flipped = axes * np.array([1.0, 1.0, -1.0])[:, None]  # the fingers are interchangeable
+    np.testing.assert_array_equal(reach_codes(arm, flipped, row, xy, turn, rise), codes)
+    assert not reach_codes(arm, np.zeros_like(axes), row, xy, turn, rise).any()  # no pose
+
+
+@needs_sim
+def test_an_arm_beyond_the_range_of_its_family_is_scaled_further() -> None:
+    axes, xy, turn, rise = attained("panda-scaled", 1.0, 100)
+    row = np.arange(100)
+    codes = reach_codes(pose_reach("panda-scaled", 1.0), axes, row, xy, turn, rise)
+    longer = reach_codes(pose_reach("panda-scaled", 1.5), axes, row, 1.5 * xy, turn, 1.5 * rise)
+    np.testing.assert_array_equal(longer[:, :, 0], codes[:, :, 0])
