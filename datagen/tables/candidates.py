@@ -12,6 +12,7 @@ import pandas
 
 from datagen.schemas.fields import OUTCOMES, Field, Table
 from datagen.schemas.shard_reading import ShardPlace
+from datagen.schemas.specification import PLACE_KINDS
 from datagen.tables.stored_fields import fields_of, refuse_unknown
 from datagen.train.reader import JOIN_FIELDS, Columns, load_shard, native
 from datagen.train.run_parts import RunPart, open_parts, refuse_twins
@@ -78,6 +79,8 @@ _DERIVED: Mapping[str, tuple[tuple[str, ...], Callable[[_Rows], Array]]] = {
         lambda rows: np.array([row.tobytes().hex() for row in rows.stored("sample_id")]),
     ),
 }
+# Columns of codes that are given as texts.
+_MEANINGS: Mapping[str, Sequence[str]] = {"outcome": tuple(OUTCOMES), "place": PLACE_KINDS}
 _DEFAULT = (
     *("run", "scene_index", "candidate_index", "robot_index", "house", "split", "room_type", "place"),
     "support_type",
@@ -156,7 +159,7 @@ def _column(rows: _Rows, name: str, there: Sequence[str]) -> Array:
 def _joined(name: str, parts: Sequence[Array]) -> Any:
     """All shards' values as one column; a shard of a run without it has NaN."""
     values = np.concatenate(parts)
-    if name == "outcome":
+    if name in _MEANINGS:
         codes = np.where(np.isnan(values), -1, values).astype(np.int8)
-        return pandas.Categorical.from_codes(codes, categories=list(OUTCOMES))
+        return pandas.Categorical.from_codes(codes, categories=list(_MEANINGS[name]))
     return pandas.Categorical(values) if values.dtype.kind == "O" else values
