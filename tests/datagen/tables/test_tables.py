@@ -13,6 +13,7 @@ from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.run import open_runs
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_reading import ShardPlace
+from datagen.schemas.specification import PLACE_KINDS
 from datagen.workers.houses import split_of
 from tests.train.conftest import sim_run
 from tests.train.stream_runs import make_stream_run
@@ -97,7 +98,7 @@ def test_a_table_joins_candidates_with_their_scenes(runs: tuple[Path, Path]) -> 
     offset = table[["base_x_target_m", "base_y_target_m"]].to_numpy()
     np.testing.assert_allclose(offset, base - target[:, :2])
     np.testing.assert_array_equal(table["base_yaw_world_rad"], dataset["base_yaw_rad"])
-    assert (table["place"] == "top").all()
+    assert table["place"].tolist() == [PLACE_KINDS[code] for code in dataset["place"].values[rows]]
     assert table["robot"].isna().all()  # heuristic labels are of no particular arm
     np.testing.assert_allclose(table["cost_s"], 1 / 18)  # a second an attempt of 3 scenes of 6
 
