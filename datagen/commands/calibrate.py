@@ -65,7 +65,7 @@ def calibrate(
     if out.exists() or out.is_symlink():
         raise InputError(out, "--out", "already exists", "Choose another name, or remove it first")
     specs = _specifications(runs, candidates)
-    trials = _read(runs, candidates, allow_incomplete, all(s.candidates.in_range_by for s in specs))
+    trials = _read(runs, candidates, allow_incomplete, all(s.candidates.within == "in-range" for s in specs))
     refuse_too_little(trials, ", ".join(runs))
     forms: tuple[Form, ...] = FORMS if distance == "any" else (distance,)
     before = specs[0].heuristic

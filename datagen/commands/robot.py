@@ -122,7 +122,6 @@ def _base(robot: Robot) -> Rows:
 
 
 def _measures(robot: Robot, q: F64) -> Rows:
-    robot.ik(robot.T_base_tcp(q[0]), q[1])  # compiles it, on a machine that has not yet
     rng, began_s, found = np.random.default_rng(1), time.monotonic(), 0
     for row in q:
         T, seeds = robot.T_base_tcp(row), q[rng.integers(0, len(q), _SEEDS)]

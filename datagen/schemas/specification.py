@@ -6,7 +6,7 @@ scenes, of which a run makes the first n samples.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +29,7 @@ class Source(Frozen):
 
 
 PlaceKind = Literal["top", "shelf", "inside", "seat", "floor", "sink"]
-PLACE_KINDS: tuple[PlaceKind, ...] = ("top", "shelf", "inside", "seat", "floor", "sink")
+PLACE_KINDS: tuple[PlaceKind, ...] = get_args(PlaceKind)
 
 
 class Places(Frozen):

@@ -113,16 +113,17 @@ def _labelled_scene(
     assert spec.arm is not None
     plain = spec.arm.model_copy(update={"trial": None, "disturbance": None, "draws": None})
     plan, plan_spec = load_label_source("plan"), spec.model_copy(update={"arm": plain})
-    scene = None
-    for draws in range(1, MOST_DECISIVE_DRAWS + 1):
-        scene, candidates = generate_scene(world, index, clock, scene)
-        labelled = plan.label(scene, candidates, plan_spec, clock)
-        low, high = DECISIVE_SHARES
-        if low <= good_share(candidates, labelled) <= high or draws == MOST_DECISIVE_DRAWS:
-            if source.name != "plan" or plan_spec != spec:
-                labelled = source.label(scene, candidates, spec, clock)
-            return scene, candidates, labelled, draws
-    raise AssertionError
+
+    def drawn(after: Scene | None) -> tuple[Scene, SceneCandidates, Columns]:
+        scene, candidates = generate_scene(world, index, clock, after)
+        return scene, candidates, plan.label(scene, candidates, plan_spec, clock)
+
+    (low, high), draws, (scene, candidates, labelled) = DECISIVE_SHARES, 1, drawn(None)
+    while draws < MOST_DECISIVE_DRAWS and not low <= good_share(candidates, labelled) <= high:
+        draws, (scene, candidates, labelled) = draws + 1, drawn(scene)
+    if source.name != "plan" or plan_spec != spec:
+        labelled = source.label(scene, candidates, spec, clock)
+    return scene, candidates, labelled, draws
 
 
 def good_share(candidates: SceneCandidates, labelled: Columns) -> float:

@@ -15,7 +15,8 @@ def on_compiling(tell: Callable[[], object]) -> Generator[None]:
     try:
         yield
     finally:
-        _listeners.clear()
+        if tell in _listeners:  # nothing was compiled
+            _listeners.remove(tell)
 
 
 def tell_of_compiling() -> None:
