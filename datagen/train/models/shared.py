@@ -35,7 +35,7 @@ from datagen.train.models.frames import (
     pair_features,
     target_features,
 )
-from datagen.train.models.hand_pooling import HandPooling
+from datagen.train.models.hand_pooling import N_SEEN_FROM_MOUNT, HandPooling
 from datagen.train.models.hand_poses import poses_of_clouds
 from datagen.train.models.hand_reach import N_STAGES, hand_reach, hands_of
 from datagen.train.models.model import Model, ModelConfig, read_config
@@ -98,6 +98,16 @@ class SharedConfig(ModelConfig):
         if self.kinematics and not self.hand_poses:
             raise ValueError("kinematics needs hand_poses")
         return self
+
+
+def with_reach(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Weights of a model without `kinematics` for one with it, whose scores are the same at first.
+
+    Its codes of reach are multiplied with 0. Weights that have codes already stay as they are.
+    """
+    name = "hands.seen.weight"
+    missing = N_SEEN_FROM_MOUNT + N_STAGES - weights[name].shape[1]
+    return {**weights, name: torch.nn.functional.pad(weights[name], (0, missing))}
 
 
 def mlp(width_in: int, widths: Sequence[int], width_out: int) -> nn.Sequential:

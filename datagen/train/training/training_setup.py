@@ -19,7 +19,7 @@ from datagen.train.dataset import SampleStream
 from datagen.train.encoded_runs import EncodedBatches, encode_runs, encoded_stream
 from datagen.train.headings import knows_headings, refuse_mixed_headings
 from datagen.train.models import Model, build_model
-from datagen.train.models.shared import SharedModel
+from datagen.train.models.shared import SharedModel, with_reach
 from datagen.train.rates import rate_fields
 from datagen.train.run_parts import open_parts, read_robots, refuse_mixed_labels
 from datagen.train.splits import HouseShare, refuse_one_class, refuse_shared_houses, split_by_house
@@ -234,11 +234,14 @@ def _model(job: TrainingJob, began: Checkpoint | None) -> Model:
     torch.manual_seed(options.seed)
     model = build_model(options.model, options.model_config)
     if began is not None:
-        other = began.head.model, began.head.model_config
-        if other != (model.name, model.config):
-            problem = f"is {other[0]} {other[1]}, not {model.name} {model.config}"
-            raise InputError(str(job.init), "model", problem, "Omit --model and --model-config")
-        put_weights(model, began.weights, str(job.init))
+        other, weights = began.head, began.weights
+        if other.model == model.name and model.config == {**other.model_config, "kinematics": True}:
+            weights = with_reach(weights)
+        elif (other.model, other.model_config) != (model.name, model.config):
+            problem = f"is {other.model} {other.model_config}, not {model.name} {model.config}"
+            fix = "Omit --model and --model-config; kinematics=true may be added"
+            raise InputError(str(job.init), "model", problem, fix)
+        put_weights(model, weights, str(job.init))
     return model.to(job.device)
 
 

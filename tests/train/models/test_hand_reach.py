@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from datagen.schemas.errors import InputError
-from datagen.train.models import Model
+from datagen.train.models import Model, build_model
 from datagen.train.models.hand_poses import HAND_WIDTH, hand_poses
 from datagen.train.models.hand_reach import hand_reach
 from datagen.train.models.hand_size import FRANKA, hand_size
-from datagen.train.models.shared import SharedModel
+from datagen.train.models.shared import SharedModel, with_reach
 from datagen.train.tensors import on_cpu
+from datagen.train.training.checkpoints import read_checkpoint
+from datagen.train.training.training_setup import prepare_training
 from tests.sim_extra import needs_robots, needs_sim
 from tests.train.models.made_batches import SMALL, Tables, drawn_tables, small_model, turned_about_z
 from tests.train.models.test_hand_poses import box, table
+from tests.train.training.small import TINY, job_of, train_until
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +73,39 @@ def test_an_unknown_robot_is_a_scaled_panda_and_a_plain_model_reads_no_robot(mod
     assert torch.equal(plain.score(*named(tables, "no such robot")), plain.score(*tables))
     with pytest.raises(InputError, match="no such robot"):
         model.score(*named(tables, "no such robot"))
+
+
+@needs_sim
+@torch.no_grad()
+def test_a_model_gets_it_without_a_change_of_its_scores() -> None:
+    tables, plain = drawn_tables(3), small_model("shared")
+    before = plain.score(*tables)
+    model = build_model("shared", {**plain.config, "kinematics": True}).eval()
+    model.load_state_dict(with_reach(plain.state_dict()))
+    torch.testing.assert_close(model.score(*tables), before)
+    again = with_reach(model.state_dict())
+    assert all(torch.equal(again[name], tensor) for name, tensor in model.state_dict().items())
+
+
+@needs_sim
+def test_further_training_may_add_it_and_changes_no_other_size(
+    heuristic_run: Path, sim_run: Path, tmp_path: Path
+) -> None:
+    plain, wider = {**TINY, "hand_poses": 8}, {**TINY, "hand_poses": 8, "kinematics": True}
+    job = job_of(heuristic_run, tmp_path / "first", model_config=plain, epochs=1)
+    assert train_until(job)[0]
+    more: dict[str, Any] = {"stage": "stage2", "epochs": 1}
+    init = {"init": job.out}
+    training, head = prepare_training(
+        replace(job_of(sim_run, tmp_path / "a", model_config=wider, **more), **init)
+    )
+    began = read_checkpoint(job.out).weights
+    for name, tensor in training.model.state_dict().items():
+        assert torch.equal(tensor, with_reach(began)[name]), name
+    assert head.model_config["kinematics"] is True
+    other = job_of(sim_run, tmp_path / "b", model_config={**wider, "width": 8}, **more)
+    with pytest.raises(InputError, match="kinematics=true may be added"):
+        prepare_training(replace(other, **init))
 
 
 @needs_robots
