@@ -108,7 +108,7 @@ def score(
         refuse_trained_objects,
     )
     from datagen.evaluation.methods import open_methods, refuse_seen_houses, score_runs
-    from datagen.evaluation.report import Part, evaluation_report, parts_of_grids
+    from datagen.evaluation.report import Part, evaluation_report, parts_by_place, parts_of_grids
     from datagen.evaluation.runs import open_evaluated_runs
 
     files = output_files(out)
@@ -128,6 +128,7 @@ def score(
     for k, (name, run) in enumerate(wanted.items()):
         part = columns.of_scenes(columns.run == k)
         parts += parts_of_grids(name, part) if run.is_of_grids else [Part(name, part, {"in-range": (k,)})]
+    parts += parts_by_place(columns)
     report = evaluation_report(seconds, compared, opened, parts, [Path(p).name for p in fitted_on], {})
     report["runs"] = [{**each, "place": name} for each, name in zip(report["runs"], wanted, strict=True)]
     report["benchmark"] = definition.record(wanted)

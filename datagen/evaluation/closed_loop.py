@@ -20,9 +20,9 @@ from datagen.evaluation.grids import (
     DISTANCES_M,
     PICKS,
     GridMaps,
+    decisive_grids,
     grid_maps,
     method_values,
-    mixed_grids,
     smoothed,
 )
 from datagen.evaluation.methods import SEED
@@ -199,7 +199,7 @@ def loop_record(loop: Loop, methods: Sequence[Method]) -> dict[str, Any]:
         for pick, cells in loop.cells.items()
     }
     weights = weights_for(loop.columns, RESAMPLES, SEED)
-    _, decisive = mixed_grids(loop.columns)
+    decisive = decisive_grids(loop.columns)
     table = partial(loop_table, outcomes, loop.arrivals, methods, weights)
     sides = {"all": np.ones(len(decisive), np.bool_), "decisive": decisive}
     return {

@@ -29,15 +29,15 @@ DISTANCES_M = (0.0, 0.03, 0.05, 0.10, 0.15, 0.25)
 PICKS = ("nominal", "smoothed")
 
 
-def mixed_grids(columns: Columns) -> tuple[Bools, Bools]:
-    """Masks (S,) of the scenes with good and bad clear cells, and of those of them that are decisive."""
+def decisive_grids(columns: Columns) -> Bools:
+    """Whether (S,) scenes are decisive: 5 to 60% of the clear cells in reach are good."""
     clear = np.bincount(columns.scene, columns.is_clear, columns.n_scenes)
     good = np.bincount(columns.scene, columns.is_clear & columns.label, columns.n_scenes)
     near = np.bincount(columns.scene, columns.is_in("in-range"), columns.n_scenes)
     good_near = np.bincount(columns.scene, columns.is_in("in-range") & columns.label, columns.n_scenes)
     low, high = DECISIVE_SHARES
     both = (good > 0) & (good < clear)
-    return both, both & (good_near >= low * near) & (good_near <= high * near)
+    return both & (good_near >= low * near) & (good_near <= high * near)
 
 
 def picks(score: F64, group: Ints, allowed: Bools) -> F64:

@@ -11,11 +11,12 @@ import numpy as np
 from datagen import __version__
 from datagen.evaluation.columns import Columns
 from datagen.evaluation.comparisons import Method
-from datagen.evaluation.grids import arrival_table, mixed_grids
+from datagen.evaluation.grids import arrival_table, decisive_grids
 from datagen.evaluation.methods import SEED, EvaluatedMethod
 from datagen.evaluation.runs import EvaluatedRun
 from datagen.evaluation.scores import evaluate_grids, evaluate_set, weights_for
 from datagen.schemas.errors import InputError
+from datagen.schemas.specification import PLACE_KINDS
 from datagen.train.arrivals import Arrival
 from datagen.train.bootstrap import LEVEL
 
@@ -58,10 +59,16 @@ def parts_by_houses(
 
 
 def parts_of_grids(name: str, columns: Columns) -> list[Part]:
-    """The grids with good and bad clear cells, and those of them that are decisive, where there are some."""
-    mixed, decisive = mixed_grids(columns)
-    sides = (("mixed", mixed), ("decisive", decisive))
-    return [Part(f"{name}, {text}", columns.of_scenes(rows), {}) for text, rows in sides if rows.any()]
+    """Whole grids, and those of them that are decisive, where there are some."""
+    sides = ((name, columns.is_grid), (f"{name}, decisive", decisive_grids(columns)))
+    return [Part(title, columns.of_scenes(rows), {}) for title, rows in sides if rows.any()]
+
+
+def parts_by_place(columns: Columns) -> list[Part]:
+    """The whole grids of all runs by the kind of place, where there is more than one kind."""
+    some = np.unique(columns.place[columns.is_grid]).tolist()
+    rows = {PLACE_KINDS[k]: columns.is_grid & (columns.place == k) for k in some}
+    return [Part(f"grids, {kind}", columns.of_scenes(r), {}) for kind, r in rows.items() if len(rows) > 1]
 
 
 def evaluation_report(

@@ -262,7 +262,7 @@ def _benchmark_notes(benchmark: Report | None) -> Iterator[tuple[str, str]]:
             else "not frozen: its candidates and labels were not compared"
         )
         yield name, f"{run['about']}; {frozen}"
-    yield "grids", f"mixed: good and bad clear cells; decisive: {_DECISIVE}"
+    yield "decisive", _DECISIVE
     if benchmark["not_scored"]:
         yield "not scored", f"{', '.join(benchmark['not_scored'])}: every row is incomplete"
 

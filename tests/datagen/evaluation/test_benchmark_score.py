@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ import numpy as np
 import pytest
 
 from datagen import cli
+from datagen.evaluation.report import parts_by_place
 from tests.datagen.evaluation.conftest import checkpoint
+from tests.datagen.evaluation.made_columns import make_columns
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
 from tests.small_runs import arrays_of, json_of
@@ -81,7 +84,7 @@ def write_near(runs: Path, out: Path, *names: str) -> None:
     out.write_text("\n".join(lines) + "\n")
 
 
-def test_grids_with_good_and_bad_cells_and_hard_ones_are_parts_of_their_own(
+def test_whole_grids_and_decisive_ones_are_parts_of_their_own(
     small_benchmark: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("grids", "benchmark.json"):
@@ -93,12 +96,12 @@ def test_grids_with_good_and_bad_cells_and_hard_ones_are_parts_of_their_own(
     near = clear & (stored["mount_distance_m"] <= stored["arm_reach_m"])
     mixed = [s for s in np.unique(scenes) if 0 < good[clear & (scenes == s)].mean() < 1]
     shares = [good[near & (scenes == s)].mean() for s in mixed]
-    expected = {"grids, mixed": len(mixed), "grids, decisive": sum(0.05 <= s <= 0.6 for s in shares)}
+    expected = {"grids": len(np.unique(scenes)), "grids, decisive": sum(0.05 <= s <= 0.6 for s in shares)}
     parts = {part["title"]: part["grids"] for part in report["parts"]}
     assert {title: grids["scenes"] for title, grids in parts.items()} == {
         title: n for title, n in expected.items() if n
     }
-    arrivals = parts["grids, mixed"]["arrivals"]
+    arrivals = parts["grids"]["arrivals"]
     assert len(arrivals) == 6 and set(arrivals[0]["methods"]["proximity"]) == {"nominal", "smoothed"}
     assert arrivals[0]["best"] == 1.0 >= arrivals[-1]["best"]
     assert report["benchmark"]["not_scored"] == ["test"]
@@ -213,3 +216,14 @@ def test_the_code_of_the_documents_writes_scores_without_this_project(
     subprocess.run([sys.executable, "-I", "-c", alone], cwd=tmp_path, check=True)
     report = scores_of(capsys, small_benchmark, str(tmp_path / "mine.csv"))
     assert report["parts"][0]["sets"]["in-range"]["methods"]["mine"]["area_under_roc"]["value"] > 0
+
+
+def test_whole_grids_of_all_runs_are_divided_by_place() -> None:
+    columns = make_columns(np.random.default_rng(1), 9, 16)
+    columns = replace(columns, is_grid=np.arange(9) != 2)
+    parts = {part.title: part.columns for part in parts_by_place(columns)}
+    assert {title: some.target.tolist() for title, some in parts.items()} == {
+        "grids, top": columns.target[[0, 4, 6, 8]].tolist(),
+        "grids, shelf": columns.target[[1, 3, 5, 7]].tolist(),
+    }
+    assert not parts_by_place(replace(columns, place=np.zeros(9, np.uint8)))

@@ -48,6 +48,7 @@ def make_batch(first: int, robots: list[int], per_robot: int = CELLS) -> Batch[A
         },
         "house_id": np.array([f"house-{first + k}" for k in range(s)], object),
         "object_name": names,
+        "place": np.zeros(s, np.uint8),
         "object_digest": names,
     }
     heights = np.ones(r, np.float32)

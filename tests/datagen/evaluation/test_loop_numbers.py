@@ -15,7 +15,7 @@ from datagen.evaluation.closed_loop import (
 )
 from datagen.evaluation.columns import Columns
 from datagen.evaluation.comparisons import Method, TrainedBy
-from datagen.evaluation.grids import AT_RANDOM, BY_LABELS, GridMaps, grid_maps, mixed_grids, smoothed
+from datagen.evaluation.grids import AT_RANDOM, BY_LABELS, GridMaps, decisive_grids, grid_maps, smoothed
 from datagen.evaluation.scores import weights_for
 from datagen.train.arrivals import Arrival, ring_arrival
 from datagen.train.inputs import F64
@@ -92,7 +92,7 @@ def test_a_drift_ahead_follows_the_heading_of_the_base() -> None:
 
 def test_rates_are_means_over_scenes_with_their_causes_and_gains() -> None:
     columns = make_grids(*lonely_and_wide())
-    _, decisive = mixed_grids(columns)
+    decisive = decisive_grids(columns)
     assert decisive.all()  # 26 of 169 cells
     good, bad = ["success"] * 2, ["no_ik", "success"]
     nominal = np.array([[bad, bad, good, ["no_lift", "no_ik"]]], object)
