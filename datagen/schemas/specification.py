@@ -203,7 +203,7 @@ class MotionParams(Frozen):
     check_step_rad: float = Field(default=0.05, ge=0.001, le=1.0)
     # Counts, not times: labels must not depend on the speed of a machine. Both are per candidate.
     max_grasps_tried: int = Field(default=150, ge=1, le=10_000)
-    path_iterations: int = Field(default=200, ge=1, le=1_000_000)
+    path_iterations: int = Field(default=2000, ge=1, le=1_000_000)
     # Rounds of a search near the grasps that came furthest, where none has a plan. None, in specifications
     # older than label version 4: no such search.
     nearby_rounds: int | None = Field(default=None, ge=0, le=50)

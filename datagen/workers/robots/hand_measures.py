@@ -18,6 +18,8 @@ _SNAP = np.cos(np.radians(15))  # directions nearer than this to an axis of the 
 _KNOTS = 33  # openings that are measured
 _CELLS = 40  # of the grid over the fingers, each way
 _PAD_M = 0.0015  # how far from the first contact the surface of a pad may lie
+_PARALLEL = 2 * np.tan(np.radians(5))  # faces that touch with a smaller slope between them are parallel
+_NEXT_M = 1e-6  # between lines on one face
 _MOVES = 0.5  # pads are where the fingers move apart by at least this share of the most
 _LEAST_OPENING_M, _CENTRED_M = 0.005, 0.004
 _HALVINGS = 14
@@ -195,8 +197,21 @@ class HandMeasures:
         if not np.isfinite(gap).any():
             fix = "Correct hand.tcp, hand.fingers or hand.range"
             raise self._wrong("hand", "its fingers do not meet: the hand cannot close on anything", fix)
-        is_pad = gap < gap.min() + _PAD_M
+        is_pad = np.abs(gap - self._touching(q, gap, x, z)) < _PAD_M
         return q, [rows[is_pad] for rows in sides]
+
+    def _touching(self, q: float, gap: F64, x: F64, z: F64) -> F64:
+        """The gap (G,) between the planes of the faces that touch first; one number where these are parallel.
+
+        Fingers that turn may touch with an edge of their pads, of which the rest is tilted.
+        """
+        first = int(gap.argmin())
+        at_x, at_z = x[first] + np.array([-1, 1, 0, 0]) * _NEXT_M, z[first] + np.array([0, 0, -1, 1]) * _NEXT_M
+        left, right = (self._surface(q, side, at_x, at_z)[:, 1] for side in (1, -1))
+        slope = np.diff((left - right).reshape(2, 2))[:, 0] / (2 * _NEXT_M)
+        if not np.linalg.norm(slope) > _PARALLEL:
+            return np.full_like(gap, gap.min())
+        return gap.min() + slope[0] * (x - x[first]) + slope[1] * (z - z[first])
 
     def _linkage(self, name: str, pad_size_m: tuple[float, float], q: float, pads: list[F64]) -> Gripper:
         before, coordinate = self._poses(q), np.linspace(q, 1.0, _KNOTS)

@@ -107,6 +107,12 @@ def test_everything_is_derived_from_a_file_of_five_lines(make: Made) -> None:
     assert len(robot.homes_rad) >= 4 and not any(robot.collides_itself(q) for q in robot.homes_rad)
 
 
+def test_pads_are_whole_faces_of_fingers_that_touch_with_an_edge(make: Made) -> None:
+    # From 0.15 rad on, the fingers diverge: of 12 cm the outer half counts, which moves apart enough.
+    gripper = open_robot(make(more="[hand.range]\nopen = [0.15, 0.6]\n"), None, 0.85).gripper
+    assert gripper.pad_size_m[1] == pytest.approx(0.06, abs=0.005)
+
+
 def test_python_and_predict_accept_a_file_wherever_a_name_is(make: Made) -> None:
     pytest.importorskip("torch")
     import datagen
@@ -287,6 +293,10 @@ def test_robots_that_only_their_own_joints_can_describe() -> None:
     np.testing.assert_allclose(out[1] - out[0], (0.0, -0.4, 0.0), atol=1e-5)  # to its right
     turned = stretch.T_base_tcp(q + (1.2, 0, 0, 0, 0, 0))[:3, 3]
     assert np.hypot(*turned[:2]) == pytest.approx(np.hypot(*stretch.T_base_tcp(q)[:2, 3]))
+    # Its rubber cups are 4 cm wide; they touch with their rear edge, tilted by 10 degrees.
+    assert stretch.gripper.pad_size_m == pytest.approx((0.04, 0.04 * np.cos(np.radians(10))), abs=0.006)
+    tips_m = max(part[:, 2].max() for part in stretch.gripper.finger_parts_m[0])
+    assert tips_m - stretch.gripper.pad_depth_m(np.zeros(1))[0] == pytest.approx(0.02, abs=0.003)
     pr2 = open_robot("pr2", None, robot_limits("pr2").base_height_m[0])  # pyright: ignore[reportOptionalSubscript]
     assert pr2.gripper.max_opening_m == pytest.approx(0.09, abs=0.003)  # as its URDF states
     tool = np.array([0.18, 0.0, 0.0])  # r_gripper_tool_frame
