@@ -38,7 +38,7 @@ class HandSize:
 
 
 FRANKA = HandSize()
-# What `_measured` finds on the Franka Hand: stroke, half pad, tips, thickness, palm's half sizes, near, far.
+# `measured_hand` of the Franka Hand: stroke, half pad, tips, thickness, palm's half sizes, near and far end.
 _FRANKA_MEASURED = np.array([0.08, 0.0088, 0.0095, 0.0152, 0.0324, 0.1029, -0.0364, -0.1303])
 _DIGITS = 4  # of measures in metres
 
@@ -46,7 +46,12 @@ _DIGITS = 4  # of measures in metres
 @lru_cache(maxsize=64)
 def hand_size(robot: str) -> HandSize:
     """The hand of a robot, by its name or file. InputError as `open_robot`."""
-    more = np.round(np.round(_measured(gripper_of(robot)), _DIGITS) - _FRANKA_MEASURED, _DIGITS)
+    # Needs the compiler, as other parts of the arm do.
+    from datagen.workers.motion.pose_reach import known_arms
+
+    known = known_arms().get(f"{robot}/hand")
+    measured = measured_hand(gripper_of(robot)) if known is None else known
+    more = np.round(np.round(measured, _DIGITS) - _FRANKA_MEASURED, _DIGITS)
     stroke, pad, tip, finger, across, closing, near, far = (more + 0.0).tolist()
     if not more.any():
         return FRANKA
@@ -69,7 +74,7 @@ def hand_size(robot: str) -> HandSize:
     )
 
 
-def _measured(gripper: Gripper) -> F64:
+def measured_hand(gripper: Gripper) -> F64:
     """Measures (8,) as `_FRANKA_MEASURED` with the fingers half open, where hands of joints hold objects."""
     opening_m = gripper.max_opening_m / 2
     finger = [part.astype(np.float64) for part in gripper.fingers_near(opening_m)[0]]

@@ -1,10 +1,16 @@
-"""How easily an arm brings its hand to poses, seen from many bases: look-ups in its capability map."""
+"""How easily an arm brings its hand to poses, seen from many bases: look-ups in its capability map.
+
+Maps of the registered robots are in `known_arms.npz`, so that a model scores for them without their URDFs;
+`scripts/known_arms.py` writes it.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
-from typing import NamedTuple
+from importlib.resources import files
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +38,7 @@ WAY_M = 0.1
 # them say how many solutions this arm has, in which arms of other joints differ.
 CODES_PER_UNIT = 72.0
 _REACH_STEP_M = 0.01
+KNOWN_ARMS = files("datagen.workers.motion") / "known_arms.npz"
 
 
 class PoseReach(NamedTuple):
@@ -54,14 +61,46 @@ def pose_reach(name: str, reach_m: float) -> PoseReach:
     A scaled robot has the reach `reach_m`, to a centimetre; beyond its range it is scaled further, with its
     hand. Others have their own.
     """
-    low, high = robot_limits(name).reach_m
+    known = known_arms()
+    reaches_m = known[f"{name}/reach_m"] if f"{name}/reach_m" in known else reaches_of(name)
+    low, high = reaches_m[0], reaches_m[-1]
     if low == high:
-        return in_memory(_coded(reach_map(open_largest(name).tree.along_z())))
-    near_m = round(min(max(reach_m, low), high) / _REACH_STEP_M) * _REACH_STEP_M
-    found = _coded(reach_map(open_robot(name, near_m, 0.0).tree.along_z()))
-    more = reach_m / near_m if not low <= reach_m <= high else 1.0
-    size = {"tcp_wrist_m": found.tcp_wrist_m * more, "half_m": found.half_m * more}
+        reach_m = low
+    step = int(np.abs(reaches_m - reach_m).argmin())
+    if f"{name}/code" in known:
+        turns, half_m, *size = known[f"{name}/size"][step].tolist()
+        code = known[f"{name}/code"]
+        found = PoseReach(code, np.array(size[:2]), np.array(size[2:]), bool(turns), half_m)
+    else:
+        found = measured_arm(name, reaches_m[step])
+    more = reach_m / reaches_m[step] if not low <= reach_m <= high else 1.0
+    size = {"tcp_wrist_m": found.tcp_wrist_m * more, "half_m": float(found.half_m * more)}
     return in_memory(found._replace(axis_xy_m=found.axis_xy_m * more, **size))
+
+
+@lru_cache(maxsize=1)
+def known_arms() -> Mapping[str, npt.NDArray[Any]]:
+    """By name and field of a robot: `hand` (8,), `reach_m` (L,), `size` (L, 7) at each, and `code` (C,)."""
+    with np.load(str(KNOWN_ARMS), allow_pickle=False) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+def reaches_of(name: str) -> F64:
+    """The reaches (L,) at which a robot has maps: the ends and whole centimetres of its range, or its own."""
+    low, high = robot_limits(name).reach_m
+    return np.round(np.linspace(low, high, 1 + round((high - low) / _REACH_STEP_M)), 6)
+
+
+def measured_arm(name: str, reach_m: float) -> PoseReach:
+    """The map of a robot at one of its reaches. InputError as `open_robot`."""
+    low, high = robot_limits(name).reach_m
+    robot = open_largest(name) if low == high else open_robot(name, reach_m, 0.0)
+    return _coded(reach_map(robot.tree.along_z()))
+
+
+def size_row(arm: PoseReach) -> list[float]:
+    """The numbers (7,) of a map beside its codes, as `known_arms` has them."""
+    return [float(arm.turns), arm.half_m, *arm.axis_xy_m.tolist(), *arm.tcp_wrist_m.tolist()]
 
 
 def _coded(reach: ReachMap) -> PoseReach:

@@ -5,8 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.workers.motion.pose_reach import pose_reach, reach_codes
-from datagen.workers.robots import open_largest, open_robot
+from datagen.train.models.hand_size import measured_hand
+from datagen.workers.motion import pose_reach as module
+from datagen.workers.motion.pose_reach import (
+    known_arms,
+    measured_arm,
+    pose_reach,
+    reach_codes,
+    reaches_of,
+    size_row,
+)
+from datagen.workers.robots import ROBOTS as NAMES
+from datagen.workers.robots import gripper_of, open_largest, open_robot
 from tests.sim_extra import needs_robots, needs_sim
 
 # An arm with axes along y, one without an upright first joint, and one whose base turns.
@@ -54,6 +64,32 @@ def test_poses_that_joints_attain_have_codes_and_far_ones_none(name: str, reach_
     flipped = axes * np.array([1.0, 1.0, -1.0])[:, None]  # the fingers are interchangeable
     np.testing.assert_array_equal(reach_codes(arm, flipped, row, xy, turn, rise), codes)
     assert not reach_codes(arm, np.zeros_like(axes), row, xy, turn, rise).any()  # no pose
+
+
+@needs_robots
+@pytest.mark.parametrize("name", NAMES)
+def test_the_shipped_hands_and_maps_are_those_of_the_robots_files(name: str) -> None:
+    """`python -m scripts.known_arms` writes them. Samples at borders may lie beyond them elsewhere."""
+    known, reaches_m = known_arms(), reaches_of(name)
+    np.testing.assert_array_equal(known[f"{name}/reach_m"], reaches_m)
+    np.testing.assert_allclose(known[f"{name}/hand"], measured_hand(gripper_of(name)), atol=1e-6)
+    for step in {0, len(reaches_m) - 1}:
+        arm = measured_arm(name, float(reaches_m[step]))
+        np.testing.assert_allclose(known[f"{name}/size"][step], size_row(arm), atol=1e-6)
+        assert (known[f"{name}/code"] != arm.code).mean() < 1e-3
+
+
+@needs_sim
+@pytest.mark.parametrize("reach_m", [0.3, 0.57, 1.0, 1.5])
+def test_scores_without_the_robots_files_are_the_same(
+    reach_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    axes, xy, turn, rise = attained("panda-scaled", 1.0, 100)
+    places = (axes, np.arange(100), xy, turn, rise)
+    shipped = reach_codes(pose_reach.__wrapped__("panda-scaled", reach_m), *places)
+    monkeypatch.setattr(module, "known_arms", dict)
+    measured = reach_codes(pose_reach.__wrapped__("panda-scaled", reach_m), *places)
+    np.testing.assert_array_equal(shipped, measured)
 
 
 @needs_sim

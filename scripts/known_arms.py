@@ -1,0 +1,33 @@
+"""Write the hands and capability maps of the registered robots, for models that score without their URDFs.
+
+python -m scripts.known_arms [OUT]
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+
+from datagen.train.models.hand_size import measured_hand
+from datagen.workers.motion.pose_reach import KNOWN_ARMS, measured_arm, reaches_of, size_row
+from datagen.workers.robots import ROBOTS, gripper_of
+
+
+def known_arms() -> dict[str, Any]:
+    """What the file has, measured anew. A family of scaled arms has one map."""
+    found: dict[str, Any] = {}
+    for name in ROBOTS:
+        reaches_m = reaches_of(name)
+        arms = [measured_arm(name, float(reach_m)) for reach_m in reaches_m]
+        assert all(np.array_equal(arm.code, arms[0].code) for arm in arms)
+        found[f"{name}/hand"] = measured_hand(gripper_of(name))
+        found[f"{name}/reach_m"] = reaches_m
+        found[f"{name}/size"] = np.array([size_row(arm) for arm in arms])
+        found[f"{name}/code"] = arms[0].code
+    return found
+
+
+if __name__ == "__main__":
+    np.savez_compressed(sys.argv[1] if len(sys.argv) > 1 else str(KNOWN_ARMS), **known_arms())
