@@ -15,7 +15,7 @@ help:
 	@echo "make demo    600 labels on the built-in world, a picture and the next command (in $(DEMO))"
 	@echo "make paper-small  labels, our network and the paper's, and tables on real houses, small (DATAGEN_ASSETS)"
 	@echo "make paper   the same with as many labels as the paper has (in build/paper)"
-	@echo "make model   the released model, its benchmark and its closed loop (in build/model)"
+	@echo "make model   the released model and its benchmark (in build/model)"
 	@echo "make test    format check, lint, types, layers, tests"
 	@echo "make slow    the tests that make test leaves out: kills, dying clusters, most long ones"
 	@echo "make faults  the full fault campaigns, as tables"
