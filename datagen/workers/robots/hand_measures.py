@@ -206,7 +206,10 @@ class HandMeasures:
         Fingers that turn may touch with an edge of their pads, of which the rest is tilted.
         """
         first = int(gap.argmin())
-        at_x, at_z = x[first] + np.array([-1, 1, 0, 0]) * _NEXT_M, z[first] + np.array([0, 0, -1, 1]) * _NEXT_M
+        at_x, at_z = (
+            x[first] + np.array([-1, 1, 0, 0]) * _NEXT_M,
+            z[first] + np.array([0, 0, -1, 1]) * _NEXT_M,
+        )
         left, right = (self._surface(q, side, at_x, at_z)[:, 1] for side in (1, -1))
         slope = np.diff((left - right).reshape(2, 2))[:, 0] / (2 * _NEXT_M)
         if not np.linalg.norm(slope) > _PARALLEL:
