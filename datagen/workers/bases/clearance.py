@@ -37,7 +37,7 @@ class Obstacles:
     floors_m: tuple[F64, ...]  # room polygons
 
     def near(self, xy_m: F64, highest_m: float, around_m: float) -> Obstacles:
-        """Those that begin below `highest_m`; some farther than `around_m` from all positions (N, 2) are left out."""
+        """Those that begin below `highest_m` and may be within `around_m` of positions (N, 2)."""
         near = (self.polygons_m.max(1) > xy_m.min(0) - around_m).all(1)
         near &= (self.polygons_m.min(1) < xy_m.max(0) + around_m).all(1)
         near &= self.low_m < highest_m
