@@ -221,7 +221,7 @@ class _Rounds:
         reach: Reach | None,
     ) -> None:
         cells = grid_offsets(params)
-        self._target_m, self._obstacles, self._params = target_center_m, obstacles, params
+        self._target_m, self._params = target_center_m, params
         self._reach = reach
         self._n_cells = len(cells)
         # The cells of all rounds, one round after the other.
@@ -229,7 +229,13 @@ class _Rounds:
         self.xy_m = (target_center_m[:2] + _jittered(cells[self._cell], params, rng)).astype(np.float32)
         self.yaw_rad = _headings(self.xy_m, target_center_m, params, rng)
         self._footprint = footprint_of(params)
-        self._free = np.ones(len(self._cell), np.bool_)
+        outer_m = self._footprint.outer_m if self._footprint else params.base_radius_m
+        highest_m = max(params.camera_height_m.high, params.base_height_m.high) + 1e-3
+        self._near = obstacles.near(
+            self.xy_m.astype(np.float64), highest_m, max(outer_m, params.mast_radius_m)
+        )
+        self._known = ObstacleDistances.unknown(len(self._cell), self._near, self._footprint is not None)
+        self._is_known, self._free = np.zeros(len(self._cell), np.bool_), np.ones(len(self._cell), np.bool_)
         # Largest distance between two positions in one cell.
         step_m = 2 * params.grid_half_width_m / (params.grid_cells - 1)
         self._apart_m = np.sqrt(2.0) * step_m if params.jitter else 0.0
@@ -254,30 +260,29 @@ class _Rounds:
             least_m = radius_m if self._footprint is None else self._footprint.inner_m
             anywhere_m = self._margins_m(rows, self._unbounded, robots, robot, least_m, exact=False)
             is_possible[self._cell[rows[anywhere_m >= -self._apart_m]]] = True
-            later = self._n_cells + np.flatnonzero(is_possible[self._cell[self._n_cells :]])
+            is_possible = is_possible[self._cell] & self._free
+            later = self._n_cells + np.flatnonzero(is_possible[self._n_cells :])
             if len(found) + len(later) < n:
                 return None
             margin_m = self._margins_m(later, self._distances(later), robots, robot, radius_m, exact=True)
-            found = np.concatenate([found, later[(margin_m >= 0) & self._free[later]]])
+            found = np.concatenate([found, later[margin_m >= 0]])
         if len(found) < n:
             return None
         self._free[found[:n]] = False
         return found[:n]
 
     def _distances(self, rows: npt.NDArray[np.int64]) -> ObstacleDistances:
-        params, footprint = self._params, self._footprint
-        # Heights of robots are rounded to float32.
-        highest_m = max(params.camera_height_m.high, params.base_height_m.high) + 1e-3
-        around_m = max(footprint.outer_m if footprint else params.base_radius_m, params.mast_radius_m)
-        return distances_from_obstacles(
-            self.xy_m[rows].astype(np.float64),
-            self._obstacles,
-            highest_m,
-            around_m,
-            footprint,
-            self.yaw_rad[rows],
-            params.base_height_m.low - 1e-3,
-        )
+        """Those of the rows' poses, each computed once for all robots."""
+        known, new = self._known, rows[~self._is_known[rows]]
+        if len(new):
+            lowest_m = self._params.base_height_m.low - 1e-3  # heights of robots are rounded to float32
+            xy_m, yaw_rad = self.xy_m[new].astype(np.float64), self.yaw_rad[new]
+            found = distances_from_obstacles(xy_m, self._near, self._footprint, yaw_rad, lowest_m)
+            known.distance_m[new], known.indoors[new] = found.distance_m, found.indoors
+            if known.base_m is not None and found.base_m is not None:
+                known.base_m[new] = found.base_m
+            self._is_known[new] = True
+        return known.at(rows)
 
     def _margins_m(
         self,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +35,13 @@ class Obstacles:
     low_m: F64  # (P,)
     high_m: F64  # (P,)
     floors_m: tuple[F64, ...]  # room polygons
+
+    def near(self, xy_m: F64, highest_m: float, around_m: float) -> Obstacles:
+        """Those that begin below `highest_m` and may be within `around_m` of positions (N, 2)."""
+        near = (self.polygons_m.max(1) > xy_m.min(0) - around_m).all(1)
+        near &= (self.polygons_m.min(1) < xy_m.max(0) + around_m).all(1)
+        near &= self.low_m < highest_m
+        return Obstacles(self.polygons_m[near], self.low_m[near], self.high_m[near], self.floors_m)
 
 
 def obstacles_of(house: House) -> Obstacles:
@@ -95,6 +102,18 @@ class ObstacleDistances:
     indoors: npt.NDArray[np.bool_]  # (N,)
     base_m: F64 | None = None  # (N, P), of a base's polygon; None where bases are circles
 
+    @staticmethod
+    def unknown(n: int, obstacles: Obstacles, has_polygon: bool) -> ObstacleDistances:
+        """Room for the distances of n positions from P obstacles."""
+        shape, low_m, high_m = (n, len(obstacles.low_m)), obstacles.low_m, obstacles.high_m
+        base_m = np.empty(shape) if has_polygon else None
+        return ObstacleDistances(np.empty(shape), low_m, high_m, np.empty(n, np.bool_), base_m)
+
+    def at(self, rows: npt.NDArray[np.int64]) -> ObstacleDistances:
+        """Those of some positions."""
+        base_m = None if self.base_m is None else self.base_m[rows]
+        return replace(self, distance_m=self.distance_m[rows], indoors=self.indoors[rows], base_m=base_m)
+
     def clearance_m(
         self,
         base_height_m: F32 | np.float32,
@@ -120,31 +139,25 @@ class ObstacleDistances:
 def distances_from_obstacles(
     xy_m: F64,
     obstacles: Obstacles,
-    highest_m: float,
-    around_m: float,
     footprint: Footprint | None = None,
     yaw_rad: F32 | None = None,
     lowest_mount_m: float = 0.0,
 ) -> ObstacleDistances:
-    """Distances of positions (N, 2), world, from obstacles that begin below `highest_m`.
+    """Distances of positions (N, 2), world, from obstacles.
 
-    Obstacles farther than `around_m` from all positions may be left out. A `footprint` has headings (N,), and
-    mounts from `lowest_mount_m` on.
+    A `footprint` has headings (N,), and mounts from `lowest_mount_m` on.
     """
-    near = (obstacles.polygons_m.max(1) > xy_m.min(0) - around_m).all(1)
-    near &= (obstacles.polygons_m.min(1) < xy_m.max(0) + around_m).all(1)
-    near &= obstacles.low_m < highest_m
-    rows = np.flatnonzero(near)
+    polygons_m, low_m, base_m = obstacles.polygons_m, obstacles.low_m, None
     blocks = (
-        signed_distances_to_convex(xy_m, obstacles.polygons_m[rows[start : start + _BLOCK]])
-        for start in range(0, len(rows), _BLOCK)
+        signed_distances_to_convex(xy_m, polygons_m[start : start + _BLOCK])
+        for start in range(0, len(polygons_m), _BLOCK)
     )
     distance_m = np.concatenate([np.empty((len(xy_m), 0)), *blocks], axis=1)
-    indoors, low_m, base_m = inside_any(xy_m, obstacles.floors_m), obstacles.low_m[rows], None
+    indoors = inside_any(xy_m, obstacles.floors_m)
     if footprint is not None and yaw_rad is not None:
         heading, counts = yaw_rad.astype(np.float64), low_m < lowest_mount_m
-        base_m = footprint.distances_m(xy_m, heading, obstacles.polygons_m[rows], distance_m, counts)
-    return ObstacleDistances(distance_m, low_m, obstacles.high_m[rows], indoors, base_m)
+        base_m = footprint.distances_m(xy_m, heading, polygons_m, distance_m, counts)
+    return ObstacleDistances(distance_m, low_m, obstacles.high_m, indoors, base_m)
 
 
 def base_clearance_m(
@@ -167,8 +180,7 @@ def base_clearance_m(
     """
     top_m = float(np.maximum(camera_height_m, base_height_m).max())
     outer_m = float(base_radius_m.max()) if footprint is None else footprint.outer_m
-    around_m, lowest_m = FAR_M + max(outer_m, mast_radius_m), float(base_height_m.min())
-    around = distances_from_obstacles(
-        base_xy_m.astype(np.float64), obstacles, top_m, around_m, footprint, yaw_rad, lowest_m
-    )
+    xy_m, lowest_m = base_xy_m.astype(np.float64), float(base_height_m.min())
+    near = obstacles.near(xy_m, top_m, FAR_M + max(outer_m, mast_radius_m))
+    around = distances_from_obstacles(xy_m, near, footprint, yaw_rad, lowest_m)
     return around.clearance_m(base_height_m, camera_height_m, base_radius_m, mast_radius_m)
