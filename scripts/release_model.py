@@ -34,9 +34,9 @@ _LIMITS = """## Limits
 
 - It was trained on planned labels in generated houses with scanned objects, from one view without noise and
   with an exact mask of the target. How it does in real rooms is not measured.
-- It was trained on one kind of arm, a Panda scaled to reaches of 0.3 to 1.0 m, on bases of 0.5 to 1.0 m. On
-  an xArm7 it is a little worse, on a Fetch much worse until it is trained further on labels of it
-  (docs/results/base-poses.md); other arms are not measured.
+- It was trained on six arms with five hands: a Panda scaled to reaches of 0.3 to 1.0 m, xArm7, Fetch, TIAGo
+  Pro, UR5 on a wide base and Stretch 3. For another arm it reads that arm's reach and hand from its file; how
+  it does on one that it has not seen is in docs/results/base-poses.md, and further training helps.
 - A good score is the chance that the arm finds a plan from there. The arm's own planner has the last word.
 - It does not see where the base fits; `datagen predict` finds that in the frame.
 - It is no safety device: nothing here keeps a robot from driving into anything.
