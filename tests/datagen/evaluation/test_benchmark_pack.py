@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -18,13 +20,16 @@ from datagen.evaluation import benchmark
 from datagen.evaluation.columns import gather
 from datagen.evaluation.runs import open_evaluated_runs
 from datagen.train.baselines import make_baselines
+from tests.conftest import REPOSITORY
 from tests.datagen.evaluation.conftest import SIDE
+from tests.linked_environments import install_wheel, link_libraries, wheel
 from tests.made_runs import files_of, flip
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
 from tests.small_runs import arrays_of, json_of
 
 pytestmark = needs_sim
+__all__ = ["wheel"]
 SCENES = 5  # of two runs: 3 of `test` with 4 candidates, 2 whole grids
 RUNS = ("test", "grids")
 
@@ -106,21 +111,51 @@ def test_without_runs_the_pack_of_the_package_is_scored(
     assert json_of(capsys, ["benchmark", "score", "proximity"])["benchmark"]["not_scored"] == []
 
 
-def test_the_code_of_the_documents_scores_the_pack_from_an_empty_folder(
+def code_of_the_documents() -> str:
+    """The Python code that reads the package's pack and writes my_scores.csv."""
+    page = (REPOSITORY / "docs" / "results" / "benchmark.md").read_text()
+    (code,) = [part.split("```")[0] for part in page.split("```python\n")[1:] if "ZipStore" in part]
+    return code
+
+
+def test_the_code_of_the_documents_scores_a_pack(
     pack: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = Path(__file__).parents[3] / "docs" / "results" / "benchmark.md"
-    (code,) = [
-        part.split("```")[0] for part in page.read_text().split("```python\n")[1:] if "ZipStore" in part
-    ]
-    where = 'Path(datagen.__file__).parent / "evaluation" / "pack"'
-    assert where in code and Path(benchmark.__file__).with_name("pack") == benchmark.PACK
-    moved = code.replace(where, f"Path({str(pack)!r})")
-    subprocess.run([sys.executable, "-c", moved], cwd=tmp_path, check=True)
+    own = 'Path(datagen.__file__).parent / "evaluation" / "pack"'
+    code = code_of_the_documents()
+    assert code.count(own) == 1 and Path(benchmark.__file__).with_name("pack") == benchmark.PACK
+    command = [sys.executable, "-c", code.replace(own, f"Path({str(pack)!r})")]
+    subprocess.run(command, cwd=tmp_path, check=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(benchmark, "PACK", pack)
     report = json_of(capsys, ["benchmark", "score", "my_scores.csv"])
-    assert report["parts"][0]["sets"]["in-range"]["methods"]["my_scores"]["area_under_roc"]["value"] > 0
+    told = report["parts"][0]["sets"]["in-range"]["methods"]["my_scores"]
+    assert told["area_under_roc"]["value"] > 0
+
+
+@pytest.mark.slow
+def test_the_extra_score_is_enough_in_an_empty_folder(wheel: Path, pack: Path, tmp_path: Path) -> None:
+    site = install_wheel(wheel, tmp_path / "venv")
+    link_libraries(site, "score")
+    shutil.rmtree(site / "datagen" / "evaluation" / "pack", ignore_errors=True)
+    shutil.copytree(pack, site / "datagen" / "evaluation" / "pack")
+    (tmp_path / "empty").mkdir()
+
+    def done(program: str, *words: str) -> subprocess.CompletedProcess[str]:
+        command = [tmp_path / "venv" / "bin" / program, *words]
+        environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "DATAGEN"))}
+        return subprocess.run(
+            command, cwd=tmp_path / "empty", env=environment, capture_output=True, text=True, check=False
+        )
+
+    assert done("python", "-c", "import torch").returncode != 0
+    assert done("python", "-c", code_of_the_documents()).returncode == 0
+    rules = ("proximity", "reach-share", "threshold", "analytic")
+    scored = done("datagen", "benchmark", "score", *rules, "my_scores.csv", "--out", "board.html")
+    assert scored.returncode == 0, scored.stderr
+    assert "my_scores" in (tmp_path / "empty" / "board.html").read_text()
+    released = done("datagen", "benchmark", "score", "released")
+    assert released.returncode == 2 and "Install the extra train: " in released.stderr
 
 
 def copied(pack: Path, folder: Path) -> Path:
