@@ -16,7 +16,7 @@ def test_a_wheel_adds_one_import_name_with_the_benchmark_the_model_and_its_frame
         sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
     names = {name.split("/")[0] for name in sizes}
     assert {name for name in names if not name.endswith(".dist-info")} == {"datagen"}
-    for folder in ("released", "benchmark"):
+    for folder in ("released", "evaluation/pack"):
         for path in (REPOSITORY / "datagen" / folder).rglob("*"):
             if path.is_file() and path.suffix != ".pyc":
                 assert sizes[str(path.relative_to(REPOSITORY))] == path.stat().st_size

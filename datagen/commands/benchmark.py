@@ -1,4 +1,4 @@
-"""`datagen benchmark`: make the runs of the frozen benchmark, and score methods on them."""
+"""`datagen benchmark`: make the runs of the frozen benchmark, pack them, and score methods on them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ from datagen.evaluation.output import Outputs, output_files, print_report, write
 from datagen.jobs.job import JobOptions
 from datagen.jobs.job_report import print_job
 
-app = App(name="benchmark", help="Make the runs of the frozen benchmark, and score methods on them.")
+app = App(
+    name="benchmark", help="Make the runs of the frozen benchmark, pack them, and score methods on them."
+)
 
 
 @app.command
@@ -78,12 +80,47 @@ def make(
 
 
 @app.command
+def pack(
+    *,
+    runs: PathOrAddress,
+    out: Path,
+    scenes: Whole = 100,
+    without_labels: bool = False,
+) -> int:
+    """Pack the first scenes of the benchmark's runs, one small file a run, with a definition of their own.
+
+    `score --runs OUT` and any Zarr reader open a pack. Equal runs give equal bytes.
+
+    For example: datagen benchmark pack --runs runs --out pack
+
+    Args:
+        runs: Folder with the runs of `datagen benchmark make`; those that it lacks are not packed.
+        out: New folder for the pack.
+        scenes: Scenes of all runs together, of which each has an equal share.
+        without_labels: Keep the labels back; `score` refuses such a pack.
+    """
+    from datagen.evaluation.benchmark import present_runs, read_benchmark, refuse_differing
+    from datagen.evaluation.benchmark_pack import write_pack
+
+    definition = read_benchmark(None if "://" in str(runs) else Path(runs))
+    paths = present_runs(str(runs), definition)
+    for name, path in paths.items():
+        refuse_differing(path, name, definition.runs[name], definition.version)
+    rows = [
+        (file.name, f"{run.n:,} candidates, {file.stat().st_size:,} bytes")
+        for file, run in write_pack(paths, definition, out, scenes, not without_labels)
+    ]
+    print_rows(f"pack of benchmark {definition.version} in {out}", rows)
+    return 0
+
+
+@app.command
 @prints(print_report)
 def score(
     methods: Annotated[Sequence[str], Parameter(name="METHOD...")],
     /,
     *,
-    runs: PathOrAddress,
+    runs: PathOrAddress | None = None,
     fit: PathsOrAddresses | None = None,
     out: Outputs = None,
     json: AsJson = False,
@@ -97,7 +134,8 @@ def score(
 
     Args:
         methods: Methods to compare.
-        runs: Folder with the runs of `datagen benchmark make`; those that it lacks are not scored.
+        runs: Folder with the runs of `datagen benchmark make`, or a pack; runs that it lacks are not scored.
+            [default: the pack that comes with datagen]
         fit: Run in validation houses to fit baselines on; repeat for more.
         out: File to write, .json or .html; repeat for both.
     """
@@ -106,17 +144,20 @@ def score(
         read_benchmark,
         refuse_differing,
         refuse_trained_objects,
+        shipped_pack,
     )
     from datagen.evaluation.methods import open_methods, refuse_seen_houses, score_runs
     from datagen.evaluation.report import Part, evaluation_report, parts_by_place, parts_of_grids
     from datagen.evaluation.runs import open_evaluated_runs
 
     files = output_files(out)
-    definition = read_benchmark(None if "://" in str(runs) else Path(runs))
-    wanted = present_runs(str(runs), definition)
+    folder = str(shipped_pack() if runs is None else runs)
+    definition = read_benchmark(None if "://" in folder else Path(folder))
+    paths = present_runs(folder, definition)
+    wanted = {name: definition.runs[name] for name in paths}
     for name, run in wanted.items():
-        refuse_differing(f"{runs}/{name}", name, run, definition.version)
-    opened = [open_evaluated_runs([f"{runs}/{name}"])[0] for name in wanted]
+        refuse_differing(paths[name], name, run, definition.version)
+    opened = [open_evaluated_runs([path])[0] for path in paths.values()]
     fitted_on = [str(path) for path in fit or ()]
     compared = open_methods(methods, fitted_on, opened, json)
     refuse_seen_houses(opened, compared, "Train it on runs of the splits train and val alone")

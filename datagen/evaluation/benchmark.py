@@ -1,13 +1,14 @@
 """The frozen benchmark: its definition, and the comparison of runs with it.
 
 The package ships `benchmark.json` in this folder; a `benchmark.json` in the folder of the runs defines
-another one. `scripts/freeze_benchmark.py` writes the digests of complete runs into a definition.
+another one. `scripts/freeze_benchmark.py` writes the digests of complete runs into a definition. A run is the
+folder of its name, or one file of a pack (`benchmark_pack.py`); `PACK` is the folder of the package's own.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,11 +24,13 @@ from datagen.schemas.run_records import Digest, StoredRecord
 from datagen.schemas.safe_files import read_regular
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
-from datagen.train.reader import SampleReader
-from datagen.train.run_parts import open_parts
+from datagen.schemas.zipped_stores import ZIPPED
+from datagen.train.reader import Columns, SampleReader
+from datagen.train.run_parts import JOIN_FIELDS, open_parts
 
 DEFINITION = "benchmark.json"
 SHIPPED = Path(str(files("datagen.evaluation") / DEFINITION))
+PACK = SHIPPED.with_name("pack")
 _MOST_BYTES = 2**20
 _MOST_SHOWN = 5
 _FIELDS = ("sample_id", "label")
@@ -119,25 +122,43 @@ def read_benchmark(folder: Path | None = None) -> Benchmark:
         raise InputError(file, where, first["msg"], fix) from None
 
 
-def present_runs(folder: str, benchmark: Benchmark) -> dict[str, BenchmarkRun]:
-    """The benchmark's runs that a folder or address has. InputError for none."""
-    found = {name: run for name, run in benchmark.runs.items() if _has_run(f"{folder}/{name}")}
+def shipped_pack() -> Path:
+    """The folder of the package's own pack. InputError where it has none."""
+    if not (PACK / DEFINITION).exists():
+        fix = "Name runs of `datagen benchmark make`, or a folder of `datagen benchmark pack`"
+        raise InputError("--runs", "", "is not given, and this version comes without a pack", fix)
+    return PACK
+
+
+def present_runs(folder: str, benchmark: Benchmark) -> dict[str, str]:
+    """Paths, by name, of the benchmark's runs that a folder or address has. InputError for none."""
+    found: dict[str, str] = {}
+    for name in benchmark.runs:
+        if _has(folder, f"{name}{ZIPPED}"):
+            found[name] = f"{folder}/{name}{ZIPPED}"
+        elif _has(f"{folder}/{name}", "manifest.json"):
+            found[name] = f"{folder}/{name}"
     if not found:
         fix = "Make them with `datagen benchmark make`"
         raise InputError(folder, "--runs", f"has no run of benchmark {benchmark.version}", fix)
     return found
 
 
-def _has_run(path: str) -> bool:
-    if "://" not in path and not Path(path).is_dir():
+def _has(folder: str, file: str) -> bool:
+    if "://" not in folder and not Path(folder).is_dir():
         return False
-    return open_storage(path, probe=False, create=False).exists("manifest.json")
+    return open_storage(folder, probe=False, create=False).exists(file)
 
 
 def digests_of(path: str | Path) -> RunDigests:
     """The digests of a complete run or of its sealed store; copies have the same digests."""
+    return digests_over(SampleReader([path], (), _FIELDS).shards())
+
+
+def digests_over(shards: Iterable[Columns]) -> RunDigests:
+    """The digests of a run with these columns."""
     candidates, labels = hashlib.sha256(), hashlib.sha256()
-    for columns in SampleReader([path], (), _FIELDS).shards():
+    for columns in shards:
         candidates.update(columns["sample_id"].tobytes())
         labels.update(columns["label"].astype("u1").tobytes())
     return RunDigests(candidates=candidates.hexdigest(), labels=labels.hexdigest())
@@ -150,7 +171,7 @@ def refuse_differing(path: str, name: str, wanted: BenchmarkRun, version: str) -
     """
     definition = f"run {name} of benchmark {version}"
     fix = f"Make it with `datagen benchmark make --run {name}`, or copy the run"
-    parts = open_parts([path], _FIELDS)
+    parts = open_parts([path], (*JOIN_FIELDS, *_FIELDS))
     for part in parts:
         ours, theirs = (s.model_dump(mode="json") for s in (wanted.spec, part.specs[0]))
         if rows := different_fields(ours, theirs):

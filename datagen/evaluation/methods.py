@@ -20,13 +20,12 @@ from datagen.evaluation.score_files import ScoreFile, read_scores
 from datagen.released import RELEASED, released_checkpoint
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
-from datagen.schemas.run import open_runs
 from datagen.schemas.specification import HeuristicParams
 from datagen.train.baselines import BASELINES, fit_baselines, make_baselines
 from datagen.train.baselines.baseline import Calibration, calibrate
 from datagen.train.baselines.scalars import Scalars
 from datagen.train.headings import refuse_other_heading, side_deg_of, trained_side_deg
-from datagen.train.run_parts import read_robots
+from datagen.train.run_parts import read_robots, specs_of
 from datagen.train.scorers import ModelScorer, Scorer, weights_sha256
 from datagen.train.splits import refuse_shared_houses
 from datagen.workers.extras import EXTRAS, how_to_get
@@ -173,7 +172,7 @@ def baseline_methods(
         names.remove("reachability")
         left_out["reachability"] = f"needs the robots' files. {how_to_get('sim')}"
     specs = [spec for run in runs for spec in run.specs]
-    specs += [run.manifest.spec for path in fit for run in open_runs(path)]
+    specs += [spec for path in fit for spec in specs_of(path)]
     arms = [spec.arm for spec in specs if spec.arm is not None]
     robots = tuple(dict.fromkeys(arm.robot_key for arm in arms if arm.robot in ROBOTS))
     made = make_baselines(names, heuristic, SEED, robots)

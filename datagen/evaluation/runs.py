@@ -10,12 +10,11 @@ from typing import Any
 from datagen.evaluation.columns import EXTRA
 from datagen.released import checkpoint_file
 from datagen.schemas.errors import InputError
-from datagen.schemas.run import open_runs
 from datagen.schemas.specification import Specification
 from datagen.train.baselines import FIELDS
 from datagen.train.dataset import SampleStream
 from datagen.train.headings import refuse_sampled_yaw
-from datagen.train.run_parts import refuse_mixed_labels
+from datagen.train.run_parts import refuse_mixed_labels, specs_of
 from datagen.workers.bases.candidate_sets import CANDIDATE_SETS
 
 # Whole scenes: a model scores a few scenes of 625 candidates at once.
@@ -85,7 +84,7 @@ def open_evaluated_runs(paths: Sequence[str]) -> list[EvaluatedRun]:
     kinds: dict[str, str] = {}
     for path in paths:
         refuse_no_trials(path)
-        specs = tuple(run.manifest.spec for run in open_runs(path))
+        specs = specs_of(path)
         for spec in specs:
             kinds.setdefault(spec.label_source, path)
             other = by_scenes.setdefault(spec.scenes_hash, spec.hash())
@@ -111,8 +110,8 @@ def stream_of(paths: Sequence[str]) -> SampleStream:
 
 def refuse_no_trials(path: str) -> None:
     """Raise InputError where a run's labels are neither sim nor plan."""
-    for run in open_runs(path):
-        source = run.manifest.spec.label_source
+    for spec in specs_of(path):
+        source = spec.label_source
         if source not in _WITH_OUTCOMES:
             problem = f"is {source}, but methods are evaluated on simulated labels"
             raise InputError(path, "label_source", problem, "Name a run of `datagen submit sim` or plan")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import secrets
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
@@ -247,7 +247,13 @@ def sealed_metadata(contents: Contents) -> dict[str, bytes]:
     attributes = described(specs, sources, [sealed.n for sealed in contents.runs]) | attributes
     rows = {table: contents.rows(table) for table in TABLES}
     of_arrays = {f.name: cf_attributes(f, table) for table, f in contents.schema.fields}
-    files = zarr_metadata(contents.schema, contents.layout, rows, attributes, of_arrays, is_sharded=True)
+    return consolidated(
+        zarr_metadata(contents.schema, contents.layout, rows, attributes, of_arrays, is_sharded=True)
+    )
+
+
+def consolidated(files: Mapping[str, bytes]) -> dict[str, bytes]:
+    """zarr.json files by path, the root's with those of all arrays."""
     make = default_buffer_prototype().buffer.from_bytes
     store = {path: make(data) for path, data in files.items()}
     with warnings.catch_warnings():

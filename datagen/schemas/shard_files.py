@@ -128,22 +128,27 @@ def _entry(path: str) -> zipfile.ZipInfo:
 
 
 def encode_array(
-    schema: RecordSchema, layout: Layout, table: Table, field: Field, values: Array
+    schema: RecordSchema,
+    layout: Layout,
+    table: Table,
+    field: Field,
+    values: Array,
+    level: int | None = None,
 ) -> dict[str, bytes]:
     """Return the chunks of one array of a full shard, by path."""
     paths = chunk_paths(schema, layout, table, field)
     step = len(values) // len(paths)
     parts = (values[first : first + step] for first in range(0, len(values), step))
-    return {path: encode_chunk(field, part) for path, part in zip(paths, parts, strict=True)}
+    return {path: encode_chunk(field, part, level) for path, part in zip(paths, parts, strict=True)}
 
 
-def encode_chunk(field: Field, values: Array) -> bytes:
-    """Encode a chunk as Zarr's codecs do."""
+def encode_chunk(field: Field, values: Array, level: int | None = None) -> bytes:
+    """Encode a chunk as Zarr's codecs do; readers need not know the level of zstd [`ZSTD_LEVEL`]."""
     if field.is_text:
         raw = VLenUTF8().encode(_checked_text(field, values))
     else:
         raw = np.ascontiguousarray(values, np.dtype(field.dtype).newbyteorder("<"))
-    return with_crc32c(bytes(Zstd(level=ZSTD_LEVEL).encode(raw)))
+    return with_crc32c(bytes(Zstd(level=ZSTD_LEVEL if level is None else level).encode(raw)))
 
 
 def with_crc32c(data: bytes) -> bytes:

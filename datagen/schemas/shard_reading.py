@@ -51,17 +51,15 @@ class Source(Protocol):
     def chunks(self, wanted: Wanted) -> Iterator[tuple[str, bytes]]: ...
 
 
-@dataclass(eq=False)
-class ShardObject:
-    """The committed object of one shard. Its sha256 is checked when it is first read."""
-
-    run: Run
-    commit: Commit
-    is_checked: bool = False
+class _Zipped:
+    """A source whose files are in one zip."""
 
     @property
     def url(self) -> str:
-        return f"{self.run.storage.url}/shards/{self.commit.object.path}"
+        raise NotImplementedError
+
+    def _open(self) -> ZipFiles:
+        raise NotImplementedError
 
     def metadata(self, names: Sequence[str]) -> dict[str, StoredArray]:
         files, paths = self._open(), {name: f"{name}/zarr.json" for name in names}
@@ -74,6 +72,19 @@ class ShardObject:
         for path in (array.path(index) for array, index in wanted):
             yield f"{self.url}/{path}", files.get(path)
 
+
+@dataclass(eq=False)
+class ShardObject(_Zipped):
+    """The committed object of one shard. Its sha256 is checked when it is first read."""
+
+    run: Run
+    commit: Commit
+    is_checked: bool = False
+
+    @property
+    def url(self) -> str:
+        return f"{self.run.storage.url}/shards/{self.commit.object.path}"
+
     def _open(self) -> ZipFiles:
         data = self.run.read_object(self.commit, check=not self.is_checked)
         self.is_checked = True
@@ -85,14 +96,14 @@ _DAMAGED = (*DAMAGED_ZIP, OverflowError)
 
 
 class ZipFiles:
-    """The files in a shard's object. InputError where it is not such a zip, or lacks a file."""
+    """The files in a shard's object or a zipped store. InputError where it is no such zip or lacks a file."""
 
     def __init__(self, place: str, data: bytes) -> None:
-        self._place = place
+        self.place = place
         try:
             self._zip = zipfile.ZipFile(io.BytesIO(data))
         except _DAMAGED as e:
-            raise InputError(place, "", f"is not the object of a shard ({e})", DAMAGE_FIX) from e
+            raise InputError(place, "", f"is not a zip of arrays ({e})", DAMAGE_FIX) from e
         self.paths = [entry.filename for entry in self._zip.infolist()]
 
     def get(self, path: str) -> bytes:
@@ -102,9 +113,23 @@ class ZipFiles:
                 raise zipfile.BadZipFile("compressed or encrypted")
             return self._zip.read(entry)
         except KeyError as e:
-            raise InputError(f"{self._place}/{path}", "", "no such file", DAMAGE_FIX) from e
+            raise InputError(f"{self.place}/{path}", "", "no such file", DAMAGE_FIX) from e
         except _DAMAGED as e:
-            raise InputError(f"{self._place}/{path}", "", f"is damaged ({e})", DAMAGE_FIX) from e
+            raise InputError(f"{self.place}/{path}", "", f"is damaged ({e})", DAMAGE_FIX) from e
+
+
+@dataclass(eq=False)
+class StoreZip(_Zipped):
+    """A store in a zip, as `encode_store` writes it."""
+
+    files: ZipFiles
+
+    @property
+    def url(self) -> str:
+        return self.files.place
+
+    def _open(self) -> ZipFiles:
+        return self.files
 
 
 @dataclass(eq=False)

@@ -14,7 +14,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.shard_reading import ShardPlace
 from datagen.schemas.stored_arrays import StoredArray
 from datagen.train.inputs import I64, Array
-from datagen.train.run_parts import open_parts
+from datagen.train.run_parts import JOIN_FIELDS, open_parts
 
 Columns = dict[str, Array]
 
@@ -31,8 +31,6 @@ SAMPLE_FIELDS = (
     "base_is_clear",
     "label",
 )
-# Fields that join the two tables; every reader needs them.
-JOIN_FIELDS = ("scene_index", "sample_scene_index")
 
 
 class SampleReader:

@@ -12,13 +12,16 @@ from datagen.schemas.errors import InputError, choices
 from datagen.schemas.fields import OLDEST_SCHEMA, SCHEMA_VERSION, SCHEMAS
 from datagen.schemas.record_files import MERGED
 from datagen.schemas.run import Rows, Run, open_runs
-from datagen.schemas.run_records import Layout
-from datagen.schemas.shard_reading import ShardPlace, StoreFiles, committed_place
+from datagen.schemas.run_records import MAX_FILE_BYTES, Layout
+from datagen.schemas.shard_reading import ShardPlace, StoreFiles, StoreZip, ZipFiles, committed_place
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
 from datagen.schemas.stored_arrays import MAX_META_BYTES, StoredArray, arrays_of, readable, sources_of
+from datagen.schemas.zipped_stores import ZIPPED
 from datagen.workers.robots import remember
 
+# Fields that join the two tables; every reader needs them.
+JOIN_FIELDS = ("scene_index", "sample_scene_index")
 _SEALED_FIX = "Seal the run again, and copy the whole data.zarr"
 
 
@@ -142,7 +145,9 @@ def _refuse_unknown(url: str, names: Sequence[str], stored: Sequence[str]) -> No
 
 
 def is_sealed_store(path: Path | str) -> bool:
-    """Whether the path ends like that of a sealed store (`.zarr`) and holds no run."""
+    """Whether the path ends like a zipped store's, or like a sealed store's (`.zarr`) and holds no run."""
+    if str(path).endswith(ZIPPED):
+        return True
     if not str(path).rstrip("/").endswith(".zarr"):
         return False
     storage = open_storage(path, probe=False, create=False)
@@ -151,11 +156,8 @@ def is_sealed_store(path: Path | str) -> bool:
 
 def open_sealed(path: Path | str, names: Sequence[str]) -> RunPart:
     """A sealed store without its run, with the named arrays, described by its own attributes."""
-    storage = open_storage(path, probe=False, create=False)
-    data = storage.get("zarr.json", 64 * MAX_META_BYTES)
-    where = f"{storage.url}/zarr.json"
-    if data is None:
-        raise InputError(where, "", "no such file", "Name a run's folder or a sealed data.zarr")
+    source, data = _sealed_files(str(path))
+    where = f"{source.url}/zarr.json"
     try:
         meta: dict[str, Any] = json.loads(data)
         attributes = meta["attributes"]
@@ -173,8 +175,7 @@ def open_sealed(path: Path | str, names: Sequence[str]) -> RunPart:
         problem = f"is {schema!r} {version}, but this program reads {readable_here}"
         raise InputError(where, "schema_version", problem, "Use the version of datagen that made the run")
     needed = sources_of(names, stored)
-    _refuse_unknown(storage.url, needed, stored)
-    source = StoreFiles(storage)
+    _refuse_unknown(source.url, needed, stored)
     arrays = readable(names, source.metadata(needed))
     scenes = {a.shape[0] for a in arrays.values() if a.dims[0] == "scene"}
     samples = {a.shape[0] for a in arrays.values() if a.dims[0] == "sample"}
@@ -192,6 +193,28 @@ def open_sealed(path: Path | str, names: Sequence[str]) -> RunPart:
     ]
     sources = tuple({} for _ in specs)
     return RunPart(str(path), spec_hashes, specs, schema, version, slices, arrays, None, sources, attributes)
+
+
+def _sealed_files(path: str) -> tuple[StoreFiles | StoreZip, bytes]:
+    """The source of a sealed store, and its root's zarr.json. InputError where it is missing."""
+    is_zip = path.endswith(ZIPPED)
+    folder, _, name = path.rpartition("/") if is_zip else (path, "", "zarr.json")
+    storage = open_storage(folder or ".", probe=False, create=False)
+    data = storage.get(name, MAX_FILE_BYTES if is_zip else 64 * MAX_META_BYTES)
+    if data is None:
+        fix = "Name a run's folder or a sealed data.zarr"
+        raise InputError(f"{storage.url}/{name}", "", "no such file", fix)
+    if not is_zip:
+        return StoreFiles(storage), data
+    files = ZipFiles(f"{storage.url}/{name}", data)
+    return StoreZip(files), files.get("zarr.json")
+
+
+def specs_of(path: Path | str) -> tuple[Specification, ...]:
+    """The specifications of the run, the merged runs or the sealed store at a path."""
+    if is_sealed_store(path):
+        return open_sealed(path, JOIN_FIELDS).specs
+    return tuple(run.manifest.spec for run in open_runs(path))
 
 
 def refuse_mixed_labels(parts: Sequence[tuple[str, Specification]]) -> None:

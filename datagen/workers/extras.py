@@ -63,6 +63,7 @@ EXTRAS: dict[str, Extra] = {
             **_PICTURES,
         },
     ),
+    "score": Extra("benchmark score of files of scores and of rules", _PICTURES),
     "cluster": Extra("workers of Ray: several processes, several machines", {"ray": "ray"}),
     "tables": Extra(
         "open_dataset and candidates: xarray and pandas", {"pandas": "pandas", "xarray": "xarray"}
