@@ -83,12 +83,15 @@ class Manifest(StoredRecord):
 
     @property
     def made_from(self) -> str:
-        """Houses, objects and robot: "400 builtin houses (split all), 10 builtin objects, sampled robots"."""
+        """Houses, objects, robot and chosen places: "400 builtin houses (split all), 10 builtin objects, ..."."""
         spec, known = self.spec, self.sources
         houses = f"{known.get('n_houses', '')} {spec.houses.kind} houses (split {spec.split})"
         objects = f"{known.get('n_objects', '')} {spec.objects.kind} objects"
         robot = f"robot {spec.arm.robot}" if spec.arm else "sampled robots"
-        return ", ".join(part.strip() for part in (houses, objects, robot))
+        weights = {} if spec.scene.places is None else spec.scene.places.weights()
+        places = "/".join(kind for kind, weight in weights.items() if weight)
+        parts = houses, objects, robot, places and f"places {places}"
+        return ", ".join(part.strip() for part in parts if part)
 
 
 class Plan(StoredRecord):
