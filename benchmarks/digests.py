@@ -3,8 +3,8 @@
     python -m benchmarks.digests [--n 3000] [--assets DIR] [--checkout DIR] [--folder FOLDER]
 
 Makes `n` labels of each source and prints, for each, the sha256 of all sample ids with their labels, and of
-all arrays of the sealed store, read by zarr alone. Targets stand on open tops. `--checkout` makes the runs with
-another checkout's code, which must know `places = {}`.
+all arrays of the sealed store, read by zarr alone. Targets stand on open tops. `--checkout` makes
+the runs with another checkout's code, which must know `places = {}`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def main() -> None:
         for source, more in RUNS.items():
             run = Path(folder) / source
             arguments = ["submit", source, "--n", str(options.n), "--out", str(run), *world, *more]
-            arguments += ["--config", str(tops)] if more else []
+            arguments += ["--config", str(tops.resolve())] if more else []
             subprocess.run(
                 [sys.executable, "-m", "datagen.cli", *arguments],
                 env={**os.environ, "PYTHONPATH": str(options.checkout.resolve())},

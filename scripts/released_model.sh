@@ -17,11 +17,12 @@ SCENES=${SCENES:-150}     # whole grids of the closed loop
 need_assets_and_programs
 mkdir -p "$OUT"
 cd "$OUT"
+printf '[scene]\nplaces = {}\n' > tops.toml # open tops alone
 submit() {
     local name=$1 n=$2 split=$3 seed=$4 each=$5
     step "$name"
     datagen submit plan --n "$n" --split "$split" --seed "$seed" --candidates in-range --candidates-per-scene "$each" \
-        --out "$name" --houses "procthor:$ASSETS/procthor" --objects ycb:objects/train
+        --config tops.toml --out "$name" --houses "procthor:$ASSETS/procthor" --objects ycb:objects/train
 }
 
 [ -f objects/test/objects.json ] || datagen assets split "$ASSETS/ycb" objects

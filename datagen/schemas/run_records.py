@@ -83,7 +83,7 @@ class Manifest(StoredRecord):
 
     @property
     def made_from(self) -> str:
-        """Houses, objects, robot and chosen places: "400 builtin houses (split all), 10 builtin objects, ..."."""
+        """Houses, objects, robot and chosen places: "400 builtin houses (split all), 58 builtin objects"."""
         spec, known = self.spec, self.sources
         houses = f"{known.get('n_houses', '')} {spec.houses.kind} houses (split {spec.split})"
         objects = f"{known.get('n_objects', '')} {spec.objects.kind} objects"
