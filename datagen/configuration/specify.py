@@ -181,7 +181,9 @@ def _kinds_in(houses: HouseSource, scene: SceneParams, candidates: CandidatePara
     for house_id in seen:
         try:
             house = houses.load(house_id)
-            house = house if house.open_doors is None else house.open_doors()
+            if house.open_doors is None:
+                return ["top"]  # the source knows no others
+            house = house.open_doors()
         except InputError:
             continue  # reported where houses are examined
         for kind in _PLACES:

@@ -88,10 +88,10 @@ class Manifest(StoredRecord):
         houses = f"{known.get('n_houses', '')} {spec.houses.kind} houses (split {spec.split})"
         objects = f"{known.get('n_objects', '')} {spec.objects.kind} objects"
         robot = f"robot {spec.arm.robot}" if spec.arm else "sampled robots"
-        weights = {} if spec.scene.places is None else spec.scene.places.weights()
-        places = "/".join(kind for kind, weight in weights.items() if weight)
-        parts = houses, objects, robot, places and f"places {places}"
-        return ", ".join(part.strip() for part in parts if part)
+        if spec.scene.places is not None:
+            kinds = (kind for kind, weight in spec.scene.places.weights().items() if weight)
+            robot += f", places {'/'.join(kinds)}"
+        return ", ".join(part.strip() for part in (houses, objects, robot))
 
 
 class Plan(StoredRecord):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 import datagen
 from datagen.configuration.specify import specify
 from datagen.configuration.toml_files import read_toml
+from datagen.jobs.job_report import JobResult
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import Specification
 from datagen.workers.houses import HouseSource, open_houses
@@ -118,8 +120,8 @@ class Furnished:
 
     kind, digest = "builtin", "1" * 64
 
-    def __init__(self, kinds: list[list[str] | None]) -> None:
-        self.kinds, self.houses = kinds, open_houses("builtin:1")
+    def __init__(self, kinds: Sequence[list[str] | None], opens: bool = True) -> None:
+        self.kinds, self.opens, self.houses = kinds, opens, open_houses("builtin:1")
 
     def house_ids(self) -> list[str]:
         return [str(k) for k in range(len(self.kinds))]
@@ -131,12 +133,13 @@ class Furnished:
         house = self.houses.load(self.houses.house_ids()[0])
         assert house.open_doors is not None
         surfaces = tuple(surface for surface in house.open_doors().surfaces if surface.kind in kinds)
-        return replace(house, surfaces=surfaces, open_doors=None)
+        opened = replace(house, surfaces=surfaces)
+        return replace(opened, open_doors=(lambda: opened) if self.opens else None)
 
 
 @needs_sim
 def test_kinds_of_places_that_houses_lack_or_the_arm_cannot_reach_are_left_out(tmp_path: Path) -> None:
-    def kinds(houses: list[list[str] | None], text: str = "") -> set[str] | None:
+    def kinds(houses: Sequence[list[str] | None], text: str = "") -> set[str] | None:
         places = near(tmp_path, text, houses=Furnished(houses)).scene.places
         return None if places is None else {kind for kind, weight in places.weights().items() if weight}
 
@@ -144,6 +147,7 @@ def test_kinds_of_places_that_houses_lack_or_the_arm_cannot_reach_are_left_out(t
     assert kinds([["top"]] * 18 + [["top", "sink"]] * 2) is None  # in a tenth of them
     assert kinds([["top"]] * 17 + [["top", "sink"]] * 3) == {"top", "sink"}
     assert kinds([None]) is None and kinds([["top"]]) is None
+    assert near(tmp_path, "", houses=Furnished([["top", "floor"]], opens=False)).scene.places is None
     low = "[candidates]\narm_reach_m = {low = 0.3, high = 0.4}\nbase_height_m = {low = 0.8, high = 0.8}\n"
     assert kinds([["top", "floor", "sink"]]) == {"top", "floor", "sink"}
     assert kinds([["top", "floor", "sink"]], low) == {"top", "sink"}
@@ -154,11 +158,23 @@ def test_kinds_of_places_that_houses_lack_or_the_arm_cannot_reach_are_left_out(t
 @needs_sim
 def test_a_run_by_default_says_where_its_targets_stand(tmp_path: Path) -> None:
     (tmp_path / "run.toml").write_text(CONFIG + QUICK)
-    run, words = tmp_path / "run", {"config": tmp_path / "run.toml", "workers": 0, "quiet": True}
-    near = {"candidates": "in-range", "candidates_per_scene": 4}
-    result = datagen.submit("plan", n=8, out=run, **near, **words)
-    assert result.made_from.endswith(", places top/shelf/inside/seat/floor/sink")
-    assert datagen.submit("plan", n=8, out=run, **near, **words).labels == 0
+    run = tmp_path / "run"
+
+    def made(n: int) -> JobResult:
+        config = tmp_path / "run.toml"
+        return datagen.submit(
+            "plan",
+            n=n,
+            out=run,
+            candidates="in-range",
+            candidates_per_scene=4,
+            config=config,
+            workers=0,
+            quiet=True,
+        )
+
+    assert made(8).made_from.endswith(", places top/shelf/inside/seat/floor/sink")
+    assert made(8).labels == 0
     assert datagen.resume(run, n=12, workers=0, quiet=True).complete
     rule = datagen.submit("heuristic", n=12, scenes_from=run, out=tmp_path / "rule", workers=0, quiet=True)
     places = [datagen.candidates(out)["place"].tolist() for out in (run, tmp_path / "rule")]
