@@ -3,7 +3,8 @@
     python -m benchmarks.digests [--n 3000] [--assets DIR] [--checkout DIR] [--folder FOLDER]
 
 Makes `n` labels of each source and prints, for each, the sha256 of all sample ids with their labels, and of
-all arrays of the sealed store, read by zarr alone. `--checkout` makes the runs with another checkout's code.
+all arrays of the sealed store, read by zarr alone. Targets stand on open tops. `--checkout` makes
+the runs with another checkout's code, which must know `places = {}`.
 """
 
 from __future__ import annotations
@@ -39,9 +40,11 @@ def main() -> None:
         world = ["--houses", f"procthor:{options.assets}/procthor", "--objects", f"ycb:{options.assets}/ycb"]
     print(f"{'source':<10} {'labels':>6} {'positive':>8}  {'ids and labels':<16}  {'all arrays':<16}")
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+        (tops := Path(folder) / "tops.toml").write_text("[scene]\nplaces = {}\n")
         for source, more in RUNS.items():
             run = Path(folder) / source
             arguments = ["submit", source, "--n", str(options.n), "--out", str(run), *world, *more]
+            arguments += ["--config", str(tops.resolve())] if more else []
             subprocess.run(
                 [sys.executable, "-m", "datagen.cli", *arguments],
                 env={**os.environ, "PYTHONPATH": str(options.checkout.resolve())},

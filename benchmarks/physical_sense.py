@@ -82,6 +82,7 @@ def planned_cases(options: argparse.Namespace) -> tuple[Specification, list[Case
         "candidates.per_scene": options.candidates,
         "candidates.robots_per_scene": 1,
         "candidates.within": "in-range",
+        "scene.places": {},  # open tops
     }
     spec = specify("sim", houses, objects, fields, None)
     plan_only = spec.model_copy(update={"arm": arm_of(spec).model_copy(update={"trial": None})})

@@ -83,6 +83,7 @@ def run(
         "seed": options.seed,
         "candidates.per_scene": per_scene,
         "candidates.within": within,
+        "scene.places": {},  # open tops
     }
     if per_scene == "grid":
         fields["candidates.robots_per_scene"] = 1

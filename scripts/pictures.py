@@ -26,7 +26,7 @@ SMALL_PX, QUALITY = 880, 65  # width of the robots' pictures, and quality of the
 def _trial(robot: str) -> list[tuple[str, ...]]:
     few = ("--n", "6", "--candidates-per-scene", "6", "--seed", "4")
     return [
-        ("submit", "sim", *few, *NEAR, "--robot", robot, "--out", "run"),
+        ("submit", "sim", *few, *NEAR, "--config", "run.toml", "--robot", robot, "--out", "run"),
         ("show", "run", "--scene", "0", "--trial", "best", "--out", "sheet.png"),
     ]
 
@@ -42,7 +42,7 @@ PICTURES: dict[str, list[tuple[str, ...]]] = {
         ("show", "run", "--scene", "2", "--out", "outcomes.png"),
     ],
     "trial.png": [
-        ("submit", "sim", "--n", "120", *NEAR, "--out", "run"),
+        ("submit", "sim", "--n", "120", "--config", "run.toml", *NEAR, "--out", "run"),
         ("show", "run", "--scene", "1", "--trial", "best", "--out", "trial.png"),
     ],
     "places.png": [
@@ -54,7 +54,7 @@ PICTURES: dict[str, list[tuple[str, ...]]] = {
 }
 
 
-# What a picture's commands find in their folder as run.toml.
+# What a picture's commands find in their folder as run.toml; the others show open tops.
 CONFIGS = {
     "places.png": "[scene]\nn_clutter = 4\ndecisive = 1.0\n[scene.places]\ninside = 1\n"
     "[candidates]\nper_scene = 30\narm_reach_m = {low = 0.9, high = 1.0}\n"
@@ -66,7 +66,7 @@ def make(name: str, out: Path) -> None:
     before = Path.cwd()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
-        Path("run.toml").write_text(CONFIGS.get(name, ""))
+        Path("run.toml").write_text(CONFIGS.get(name, "[scene]\nplaces = {}\n"))
         try:
             for words in PICTURES[name]:
                 if cli.run([*words, *(("--workers", "0") if words[0] == "submit" else ())]):

@@ -12,7 +12,7 @@ ROOT=$(realpath "$(dirname "$0")/..")
 OUT=$(realpath -m "${1:-$ROOT/build/model}")
 LABELS=${LABELS:-200010}  # at open tops, within reach of a scaled Panda
 MIX=${MIX:-24000}         # of that arm at places of all kinds
-EACH=${EACH:-3600}         # of each other arm there
+EACH=${EACH:-3600}        # of each other arm there
 EPOCHS=${EPOCHS:-12}
 OTHERS="fetch xarm7 tiago-pro ur5 stretch3"
 
@@ -46,7 +46,7 @@ datagen train sim-only tops --val tops-val --epochs "$EPOCHS" --model-config wid
 step "training on all places and arms"
 mixes=(mix-panda-scaled)
 for robot in $OTHERS; do mixes+=("mix-$robot"); done
-datagen train stage2 "${mixes[@]}" --val val --init tops.ckpt --model-config kinematics=true --epochs "$EPOCHS" \
+datagen train stage2 "${mixes[@]}" --val val --init tops.ckpt --model-config kinematics=true --epochs 8 \
     --encoded mixed-inputs --threads 1 --out model.ckpt
 step scores
 [ board.json -nt model.ckpt ] || datagen benchmark score model.ckpt scalars reachability reach-share distance proximity \

@@ -22,6 +22,9 @@ A run's specification is everything that decides its samples; its hash names the
 Fields that are absent by default are commented out, with the values that they have once set: `arm` is for
 `plan` and `sim`, `arm.trial` and `arm.disturbance` for `sim`. Comments give ranges and choices.
 
+`plan` and `sim` labels with `within = "in-range"` have other defaults of `places`, `n_clutter` and `decisive`
+([places](../explanation/label-sources.md#which-places)); `places = {}` and `decisive = 0` mean none.
+
 """
 _RESERVED = {"label_source", "houses", "objects", "scenes_from", "engines"}
 # Set by the program, from the robot that is named.

@@ -30,6 +30,8 @@ n_farthest = 64
 [visibility]
 window_px = 24
 """
+# Of plans and trials within reach: no places where parking decides, which take several times as long.
+OPEN_TOPS = "[scene]\nplaces = {}\n"
 # Of plans on whole grids. Long arms and small grids, so that most grids have good and bad clear cells.
 GRID_CONFIG = (
     CONFIG

@@ -137,7 +137,9 @@ def submit(options: SubmitOptions) -> JobResult:
     """Make labels: start a run, or resume the run in the folder.
 
     To train a model, make plan labels with --candidates in-range; to repeat the paper, heuristic labels; to
-    measure success in physics, sim labels.
+    measure success in physics, sim labels. Plan and sim labels in-range have their targets by default where
+    parking decides: on tops and shelves, in cupboards, on seats, floors, in sinks. scene.places = {} in the
+    --config file keeps open tops alone, for a quarter of the cost.
 
     The same command on the same folder resumes the run, and a larger --n extends it; other options are
     refused with the fields that differ. Ctrl-C finishes the running attempts, a second Ctrl-C stops at once;

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from collections import Counter
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -22,7 +23,9 @@ from datagen.schemas.specification import (
     ArmParams,
     CandidateParams,
     DisturbanceParams,
+    PlaceKind,
     Range,
+    SceneParams,
     Source,
     Specification,
     Turns,
@@ -36,6 +39,7 @@ from datagen.workers.labels import load_label_source
 from datagen.workers.objects.model import ObjectSource
 from datagen.workers.rendering import RENDERERS, load_renderer
 from datagen.workers.robots import coordinates_of, remember, robot_digest, robot_limits, robot_source
+from datagen.workers.scenes.placement import eligible_surfaces
 from datagen.workers.settling import SETTLERS, first_settler, load_settler
 
 Fields = dict[str, Any]
@@ -55,8 +59,14 @@ _MOST_BYTES = 32 * 2**20
 _SHARDS, _SHARDS_AT_LEAST = 64, 8
 # Core seconds of a label, scene included, and bytes of a cloud's point (docs/results/speed.md).
 _LABEL_S = {"heuristic": 0.002, "plan": 0.03, "sim": 0.1}
+_DECISIVE_COST = 4  # times that, where scenes are drawn until they are decisive
 _POINT_BYTES = 10
 _NEARBY_ROUNDS = 3  # of the search near failed grasps
+# By default, for labels within reach: places of targets by weight, most clutter, share of decisive scenes.
+_PLACES: dict[PlaceKind, float] = {"top": 2, "shelf": 2, "inside": 3, "seat": 1, "floor": 1, "sink": 1}
+_CLUTTER, _DECISIVE = 14, 0.5
+_HOUSES_SEEN, _SHARE_WITH_PLACE = 20, 0.1  # to find the kinds of places that a source has
+_ABOVE_LOWEST_M = 0.1  # from the lowest point within reach to the lowest place
 
 
 def specify(
@@ -95,12 +105,11 @@ def specify(
             candidates.setdefault("scaled_base", True)
         if label_source in ARM_PACKAGES and "within" not in candidates:
             candidates.setdefault("per_scene", "grid")
-        scene = fields.get("scene")
-        asked = scene if isinstance(scene, dict) else {}
-        is_arm = label_source in ARM_PACKAGES
-        if is_arm and candidates.get("within") == "in-range" and _needs_set(chosen, "places" in asked):
+        is_near = label_source in ARM_PACKAGES and candidates.get("within") == "in-range"
+        asked = complete_scene(fields, candidates, houses if is_near else None)
+        if is_near and _needs_set(chosen, asked.get("places") is not None):
             candidates.setdefault("in_range_by", "reachable-set")
-        if candidates.get("per_scene") == "grid" or "decisive" in asked:
+        if candidates.get("per_scene") == "grid" or asked.get("decisive") is not None:
             # The cells of a whole grid are ranked against each other, so they have one robot.
             candidates.setdefault("robots_per_scene", 1)
     fields |= {
@@ -134,6 +143,52 @@ def specify(
     load_settler(spec.settle.engine)
     load_renderer(spec.observation.renderer)
     return spec.model_copy(update={"engines": scene_engines(spec) | label_engines(spec.label_source)})
+
+
+def complete_scene(fields: Fields, candidates: Fields, houses: HouseSource | None) -> Fields:
+    """Fill in the section `scene` of a specification's fields, and return it.
+
+    In place of open tops alone it has the mix of places where parking decides, of those that `houses` have;
+    None keeps open tops. In the file `places = {}` and `decisive = 0` say that there are none.
+    """
+    scene = fields.setdefault("scene", {})
+    if not isinstance(scene, dict):
+        return {}  # the specification refuses it
+    is_default = houses is not None and "places" not in scene
+    for name, nothing in (("places", {}), ("decisive", 0)):
+        if scene.get(name) == nothing:
+            scene[name] = None
+    if houses is None or not is_default:
+        return scene
+    try:
+        params = SceneParams.model_validate(scene), CandidateParams.model_validate(candidates)
+    except ValidationError:
+        return scene
+    kinds = _kinds_in(houses, *params)
+    if kinds not in ([], ["top"]):
+        scene |= {"places": {kind: _PLACES[kind] for kind in kinds}}
+        scene.setdefault("n_clutter", _CLUTTER)
+        if candidates.get("robots_per_scene", 1) == 1:
+            scene.setdefault("decisive", _DECISIVE)
+    return scene
+
+
+def _kinds_in(houses: HouseSource, scene: SceneParams, candidates: CandidateParams) -> list[PlaceKind]:
+    """The kinds of places that are not rare in houses, nor all too low for the arm."""
+    lowest_m = candidates.base_height_m.low - candidates.arm_reach_m.high + _ABOVE_LOWEST_M
+    found, ids = Counter[PlaceKind](), houses.house_ids()
+    seen = ids[:: max(1, len(ids) // _HOUSES_SEEN)][:_HOUSES_SEEN]
+    for house_id in seen:
+        try:
+            house = houses.load(house_id)
+            if house.open_doors is None:
+                return ["top"]  # the source knows no others
+            house = house.open_doors()
+        except InputError:
+            continue  # reported where houses are examined
+        for kind in _PLACES:
+            found[kind] += any(s.height_m >= lowest_m for s in eligible_surfaces(house, scene, kind))
+    return [kind for kind in _PLACES if found[kind] > _SHARE_WITH_PLACE * len(seen)]
 
 
 def _needs_set(robot: str | None, has_places: bool) -> bool:
@@ -183,6 +238,7 @@ def layout_of(spec: Specification, n: int) -> Layout:
     """
     scenes = -(-n // spec.candidates.count)
     scene_s = spec.candidates.count * _LABEL_S.get(spec.label_source, _LABEL_S["plan"])
+    scene_s *= _DECISIVE_COST if spec.scene.decisive else 1
     largest = min(_LONGEST_S / scene_s, _MOST_BYTES / (_POINT_BYTES * spec.observation.n_points))
     shared = max(scenes // _SHARDS, min(scenes // _SHARDS_AT_LEAST, int(_SHORTEST_S / scene_s)))
     most = max(1, min(int(largest), shared))

@@ -31,7 +31,7 @@ class JobResult:
     # detached: Ray makes the labels. failed: too many shards are quarantined. dry-run: nothing was made.
     end: Literal["complete", "failed", "interrupted", "detached", "dry-run"]
     n: int = 0  # labels wanted
-    made_from: str = ""  # houses, objects and robot
+    made_from: str = ""  # houses, objects, robot and places
     labels: int = 0  # made by this job
     positives: int = 0  # among them
     shards: int = 0  # that were missing when the job began

@@ -83,11 +83,14 @@ class Manifest(StoredRecord):
 
     @property
     def made_from(self) -> str:
-        """Houses, objects and robot: "400 builtin houses (split all), 10 builtin objects, sampled robots"."""
+        """Houses, objects, robot and chosen places: "400 builtin houses (split all), 58 builtin objects"."""
         spec, known = self.spec, self.sources
         houses = f"{known.get('n_houses', '')} {spec.houses.kind} houses (split {spec.split})"
         objects = f"{known.get('n_objects', '')} {spec.objects.kind} objects"
         robot = f"robot {spec.arm.robot}" if spec.arm else "sampled robots"
+        if spec.scene.places is not None:
+            kinds = (kind for kind, weight in spec.scene.places.weights().items() if weight)
+            robot += f", places {'/'.join(kinds)}"
         return ", ".join(part.strip() for part in (houses, objects, robot))
 
 

@@ -13,13 +13,14 @@ from datagen.reports.agreement import doubt, read_labels
 from datagen.schemas.fields import OUTCOMES
 from datagen.schemas.run import Run
 from tests.sim_extra import needs_sim
-from tests.small_runs import CONFIG, HERE, json_of
+from tests.small_runs import CONFIG, HERE, OPEN_TOPS, json_of
 
 pytestmark = needs_sim
 
 EACH = 28
 # A hand that keeps farther from the target than its pregrasp is.
-NO_GRASP = CONFIG + "[arm.motion]\nmargin_m = 0.2\n[arm.grasps]\nper_object = 40\nper_scene = 10\n"
+FEW_GRASPS = "[arm.motion]\nmargin_m = 0.2\n[arm.grasps]\nper_object = 40\nper_scene = 10\n"
+NO_GRASP = CONFIG + OPEN_TOPS + FEW_GRASPS
 
 
 def test_a_run_and_its_audit_ask_where_no_label_is_positive(

@@ -29,7 +29,7 @@ from datagen.workers.robots import ROBOTS, robot_limits
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
-from tests.small_runs import CONFIG, HERE, PER_SCENE, arrays_of, make_small_run
+from tests.small_runs import CONFIG, HERE, OPEN_TOPS, PER_SCENE, arrays_of, make_small_run
 from tests.train.prediction.checkpoints import document_of, stored_with, write_untrained
 from tests.train.prediction.seen_scenes import MODEL
 from tests.train.prediction.test_trained_robots import SIZES, origin
@@ -133,7 +133,7 @@ def sideways(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     base = f'footprint_m = {OUTLINE}\nheight_m = 0.6\npresents = "side"\nside_deg = -90\n'
     robot = folder / "sideways.toml"
     robot.write_text(text.replace("pedestal = true\n", base))
-    (folder / "run.toml").write_text(CONFIG + "[arm.grasps]\nper_object = 40\nper_scene = 10\n")
+    (folder / "run.toml").write_text(CONFIG + OPEN_TOPS + "[arm.grasps]\nper_object = 40\nper_scene = 10\n")
     line = ["submit", "plan", "--n", str(2 * ROWS), "--out", str(folder / "run"), "--robot", str(robot)]
     more = ["--candidates", "in-range", "--candidates-per-scene", str(ROWS), "--seed", "5", *HERE]
     assert cli.run([*line, *more, "--config", str(folder / "run.toml")]) == 0
@@ -265,7 +265,7 @@ def test_a_model_that_knows_kinematics_trains_on_robots_that_stand_otherwise(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     robot_file, run = sideways
-    (tmp_path / "run.toml").write_text(CONFIG + "[arm.grasps]\nper_object = 40\nper_scene = 10\n")
+    (tmp_path / "run.toml").write_text(CONFIG + OPEN_TOPS + "[arm.grasps]\nper_object = 40\nper_scene = 10\n")
     ahead = tmp_path / "ahead"
     line = ["submit", "plan", "--n", "40", "--out", str(ahead), "--robot", "panda", *HERE, "--seed", "2"]
     more = ["--candidates", "in-range", "--candidates-per-scene", "4", "--config", str(tmp_path / "run.toml")]

@@ -15,7 +15,7 @@ import pytest
 from datagen import cli
 from tests.linked_environments import install_wheel, link_libraries, own_files, wheel
 from tests.sim_extra import needs_sim
-from tests.small_runs import CONFIG, PER_SCENE, make_small_run, submit_arguments
+from tests.small_runs import CONFIG, OPEN_TOPS, PER_SCENE, make_small_run, submit_arguments
 from tests.train.prediction.checkpoints import write_untrained
 from tests.train.prediction.seen_scenes import draw_seen, write_frame
 
@@ -171,7 +171,7 @@ def test_models_train_and_predict_without_simulators(wheel: Path, tmp_path: Path
 @needs_sim
 def test_models_are_judged_without_simulators(wheel: Path, tmp_path: Path) -> None:
     train = Installed(wheel, tmp_path, "train")
-    (tmp_path / "plan.toml").write_text(CONFIG + "\n[arm.grasps]\nper_object = 40\n")
+    (tmp_path / "plan.toml").write_text(CONFIG + OPEN_TOPS + "[arm.grasps]\nper_object = 40\n")
     few = ["--n", "48", "--candidates", "in-range", "--candidates-per-scene", "8", "--workers", "0"]
     made = ["submit", "plan", *few, "--config", str(tmp_path / "plan.toml"), "--out", str(tmp_path / "plans")]
     assert cli.run(made) == 0
@@ -186,7 +186,9 @@ def test_models_are_judged_without_simulators(wheel: Path, tmp_path: Path) -> No
 @needs_sim
 def test_all_extras_label_on_ray_and_show_the_demonstration(wheel: Path, tmp_path: Path) -> None:
     whole, few = Installed(wheel, tmp_path, "all"), ["--n", "48", "--candidates-per-scene", "8"]
-    (tmp_path / "plan.toml").write_text(CONFIG + "\n[arm.grasps]\nper_object = 40\nper_scene = 10\n")
+    (tmp_path / "plan.toml").write_text(
+        CONFIG + OPEN_TOPS + "[arm.grasps]\nper_object = 40\nper_scene = 10\n"
+    )
     plan = ["submit", "plan", "--out", "plan", "--candidates", "in-range", "--config", "plan.toml", *few]
     for done in whole.run(plan, ["predict", "--demo"]):
         assert done.code == 0, done

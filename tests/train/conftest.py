@@ -15,6 +15,7 @@ SCENES, CANDIDATES, TRIED = 12, 16, 6
 # Arms long enough to take something, and little else to see, plan and execute.
 ARM = """
 [scene]
+places = {}
 n_clutter = 2
 
 [candidates]

@@ -48,7 +48,7 @@ _CAUSES = {
     "bad_house": ("houses cannot be used", "Correct or remove them; `submit --dry-run` names each"),
     "no_surface": (
         "houses have no support surface of the specified height and size",
-        "Check scale and axes of the houses, or widen scene.support_height_m",
+        "Omit the kind in scene.places, widen scene.support_height_m, or check scale and axes of the houses",
     ),
     "no_placement": (
         "target and clutter find no free place on the surface",

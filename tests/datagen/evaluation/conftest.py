@@ -13,7 +13,7 @@ from datagen.evaluation.benchmark import Benchmark, BenchmarkRun, digests_of
 from datagen.schemas.run import Run
 from datagen.train.models import build_model
 from datagen.train.training.checkpoints import Checkpoint, CheckpointHead, write_checkpoint
-from tests.small_runs import GRID_CONFIG
+from tests.small_runs import GRID_CONFIG, OPEN_TOPS
 from tests.train.training.small import TINY
 
 SIDE = 5
@@ -24,7 +24,7 @@ SIZES = {"test": 32, "grids": 6 * SIDE * SIDE}
 def small_benchmark(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the runs and of their definition, benchmark.json. Tests only read it."""
     folder = tmp_path_factory.mktemp("benchmark")
-    (folder / "small.toml").write_text(GRID_CONFIG.format(side=SIDE))
+    (folder / "small.toml").write_text(GRID_CONFIG.format(side=SIDE) + OPEN_TOPS)
     kinds = {"test": ["--candidates", "in-range", "--candidates-per-scene", "4"], "grids": []}
     runs: dict[str, BenchmarkRun] = {}
     for seed, (name, kind) in enumerate(kinds.items()):

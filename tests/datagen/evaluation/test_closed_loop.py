@@ -23,7 +23,7 @@ from tests.small_runs import GRID_CONFIG, arrays_of, json_of
 pytestmark = needs_sim
 
 SIDE, SCENES = 7, 5
-GRID = GRID_CONFIG.format(side=SIDE) + "\n[scene]\nn_clutter = 1\n"
+GRID = GRID_CONFIG.format(side=SIDE) + "\n[scene]\nplaces = {}\nn_clutter = 1\n"
 QUICK = ("--baselines", "proximity", "--baselines", "analytic")
 NEAR, FAR = "disc:0", "normal:0.1,3deg"
 
