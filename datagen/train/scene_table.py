@@ -85,7 +85,7 @@ def read_scene_table(
                 rows.append((number, scene, _taken(columns["robot_index"][first:past], per_robot)))
                 house_ids.add(house)
                 house_of_digest[str(columns["house_digest"][scene])] = house
-                objects |= set(map(str, columns["object_digest"][scene]))
+                objects |= set(map(str, columns["object_digest"][scene])) - {""}  # places without clutter
             number += 1
         negatives, positives = counts.tolist()
         summaries.append(PartSummary(part, len(rows) - begun, negatives, positives, digest.hexdigest()))
