@@ -21,6 +21,7 @@ from datagen.train.augment import Augmentation, ColourJitter, PointDropout, Rota
 from datagen.train.baselines.baseline import mount_m
 from datagen.train.dataset import SampleStream
 from datagen.train.inputs import Array, Batch
+from tests.small_runs import CONFIG, arrays_of, make_small_run
 from tests.train.stream_runs import HOUSES, ROBOT_FIELDS, make_stream_run, stream_rows
 
 N, SCENES, SHARDS = 113, 19, 7
@@ -212,6 +213,14 @@ def test_reading_ahead_is_bounded_and_ends_with_the_iterator(place: str):
         assert readers() == 1
         close(batches)
         assert readers() == 0
+
+
+def test_clutter_that_is_absent_is_no_object(tmp_path: Path):
+    """Scenes at places have 0 to `n_clutter` objects around the target, and empty names for the others."""
+    config = f"{CONFIG}\n[scene]\nn_clutter = 3\n[scene.places]\ntop = 1\n"
+    run = make_small_run(tmp_path / "run", 24, per_scene=4, config=config)
+    digests = {str(digest) for digest in np.ravel(arrays_of(run)["object_digest"])}
+    assert "" in digests and SampleStream([run]).object_digests() == digests - {""}
 
 
 def test_houses_choose_the_scenes(place: str):
