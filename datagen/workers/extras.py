@@ -58,6 +58,7 @@ EXTRAS: dict[str, Extra] = {
         "train, evaluate, predict",
         {
             "torch": "torch",
+            "numba": "numba",
             "safetensors": "safetensors",
             "plotly": "plotly",
             **_PICTURES,
