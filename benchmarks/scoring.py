@@ -41,7 +41,7 @@ MODELS: list[tuple[str, str, dict[str, Any]]] = [
     ("shared, tokens alone", "shared", {"hand_poses": 0, "observed_visibility": False}),
     ("shared, and visibility", "shared", {"hand_poses": 0}),
     ("shared", "shared", {}),
-    ("shared, as released", "shared", {"width": 96, "embedding": 160}),
+    ("shared, as released", "shared", {"width": 96, "embedding": 160, "kinematics": True}),
     ("paper, lighter", "paper", LIGHT),
     ("paper", "paper", {}),
 ]
