@@ -12,7 +12,7 @@ import numpy as np
 
 from datagen.train.models.hand_size import measured_hand
 from datagen.workers.motion.pose_reach import KNOWN_ARMS, measured_arm, reaches_of, size_row
-from datagen.workers.robots import ROBOTS, gripper_of
+from datagen.workers.robots import ROBOTS, gripper_of, robot_digest
 
 
 def known_arms() -> dict[str, Any]:
@@ -22,6 +22,7 @@ def known_arms() -> dict[str, Any]:
         reaches_m = reaches_of(name)
         arms = [measured_arm(name, float(reach_m)) for reach_m in reaches_m]
         assert all(np.array_equal(arm.code, arms[0].code) for arm in arms)
+        found[f"{name}/digest"] = np.array(robot_digest(name) or "")
         found[f"{name}/hand"] = measured_hand(gripper_of(name))
         found[f"{name}/reach_m"] = reaches_m
         found[f"{name}/size"] = np.array([size_row(arm) for arm in arms])

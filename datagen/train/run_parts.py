@@ -55,10 +55,16 @@ class RunPart:
 
 
 def read_robots(parts: Iterable[RunPart]) -> None:
-    """Read the files of robots that runs were made with. InputError where one is missing or has changed."""
+    """Read the files of robots that runs were made with, unless they are known without.
+
+    InputError where one is missing or has changed.
+    """
+    # Needs the compiler, as other parts of the arm do.
+    from datagen.workers.motion.pose_reach import known_arm
+
     for part in parts:
         arm = part.specs[0].arm if part.specs else None
-        if arm is not None and arm.robot_digest is not None:
+        if arm is not None and arm.robot_digest is not None and not known_arm(arm.robot_key):
             place = part.sources[0].get("robot") if part.sources else None
             remember(place or arm.robot, arm.robot, arm.robot_digest)
 

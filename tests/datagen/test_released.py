@@ -20,6 +20,7 @@ import datagen
 from datagen import cli, released
 from datagen.evaluation.benchmark import read_benchmark
 from datagen.evaluation.methods import open_models
+from datagen.schemas.specification import PLACE_KINDS
 from datagen.train.scorers import weights_sha256
 from datagen.train.training.checkpoints import read_checkpoint
 from scripts.release_model import card_text
@@ -51,7 +52,10 @@ def test_the_file_the_benchmark_and_the_page_are_those_of_the_card() -> None:
     assert [dict(each) for each in head.data] == card["data"]
     shipped = read_benchmark()
     assert card["benchmark"] == {"version": shipped.version, "digest": shipped.digest()}
-    assert list(card["metrics"]) == ["test", "test-known", "trials", "grids, mixed", "grids, hard"]
+    runs = [name for name, run in shipped.runs.items() if run.is_of_grids]
+    assert set(card["metrics"]) == {
+        *shipped.runs, *(f"{run}, decisive" for run in runs), *(f"grids, {kind}" for kind in PLACE_KINDS)
+    }  # fmt: skip
     page = card_text(card, (FOLDER / released.RECIPE).read_text("utf-8"))
     assert page == (FOLDER / released.CARD_PAGE).read_text("utf-8")
 

@@ -47,10 +47,10 @@ _DIGITS = 4  # of measures in metres
 def hand_size(robot: str) -> HandSize:
     """The hand of a robot, by its name or file. InputError as `open_robot`."""
     # Needs the compiler, as other parts of the arm do.
-    from datagen.workers.motion.pose_reach import known_arms
+    from datagen.workers.motion.pose_reach import known_arm
 
-    known = known_arms().get(f"{robot}/hand")
-    measured = measured_hand(gripper_of(robot)) if known is None else known
+    known = known_arm(robot)
+    measured = known["hand"] if known else measured_hand(gripper_of(robot))
     more = np.round(np.round(measured, _DIGITS) - _FRANKA_MEASURED, _DIGITS)
     stroke, pad, tip, finger, across, closing, near, far = (more + 0.0).tolist()
     if not more.any():

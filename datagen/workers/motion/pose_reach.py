@@ -61,16 +61,15 @@ def pose_reach(name: str, reach_m: float) -> PoseReach:
     A scaled robot has the reach `reach_m`, to a centimetre; beyond its range it is scaled further, with its
     hand. Others have their own.
     """
-    known = known_arms()
-    reaches_m = known[f"{name}/reach_m"] if f"{name}/reach_m" in known else reaches_of(name)
+    known = known_arm(name)
+    reaches_m = known["reach_m"] if known else reaches_of(name)
     low, high = reaches_m[0], reaches_m[-1]
     if low == high:
         reach_m = low
     step = int(np.abs(reaches_m - reach_m).argmin())
-    if f"{name}/code" in known:
-        turns, half_m, *size = known[f"{name}/size"][step].tolist()
-        code = known[f"{name}/code"]
-        found = PoseReach(code, np.array(size[:2]), np.array(size[2:]), bool(turns), half_m)
+    if known:
+        turns, half_m, *row = known["size"][step].tolist()
+        found = PoseReach(known["code"], np.array(row[:2]), np.array(row[2:]), bool(turns), half_m)
     else:
         found = measured_arm(name, reaches_m[step])
     more = reach_m / reaches_m[step] if not low <= reach_m <= high else 1.0
@@ -78,11 +77,17 @@ def pose_reach(name: str, reach_m: float) -> PoseReach:
     return in_memory(found._replace(axis_xy_m=found.axis_xy_m * more, **size))
 
 
-@lru_cache(maxsize=1)
-def known_arms() -> Mapping[str, npt.NDArray[Any]]:
-    """By name and field of a robot: `hand` (8,), `reach_m` (L,), `size` (L, 7) at each, and `code` (C,)."""
+@lru_cache(maxsize=64)
+def known_arm(name: str) -> Mapping[str, npt.NDArray[Any]]:
+    """`hand` (8,), `reach_m` (L,), `size` (L, 7) at each and `code` (C,) of a registered robot; {} of others.
+
+    The name may have the digest of its files, as in a specification: other files are another robot.
+    """
+    plain, _, digest = name.partition("@")
     with np.load(str(KNOWN_ARMS), allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
+        if f"{plain}/digest" not in stored or digest not in ("", str(stored[f"{plain}/digest"])):
+            return {}
+        return {field: stored[f"{plain}/{field}"] for field in ("hand", "reach_m", "size", "code")}
 
 
 def reaches_of(name: str) -> F64:
@@ -99,7 +104,7 @@ def measured_arm(name: str, reach_m: float) -> PoseReach:
 
 
 def size_row(arm: PoseReach) -> list[float]:
-    """The numbers (7,) of a map beside its codes, as `known_arms` has them."""
+    """The numbers (7,) of a map beside its codes, as `known_arm` has them."""
     return [float(arm.turns), arm.half_m, *arm.axis_xy_m.tolist(), *arm.tcp_wrist_m.tolist()]
 
 

@@ -131,14 +131,14 @@ def test_a_broken_definition_is_one_line(
 
 def test_the_shipped_definition_holds_out_houses_and_objects() -> None:
     shipped = read_benchmark()
-    assert list(shipped.runs) == ["test", "test-known", "trials", "grids"]
+    grids = ["grids", "grids-ur5", "grids-stretch3", "grids-tiago-pro", "grids-pr2"]
+    assert list(shipped.runs) == [*grids, "test", "trials", "tops"]
     assert {run.spec.split for run in shipped.runs.values()} == {"test"}
-    assert {name: run.objects for name, run in shipped.runs.items()} == {
-        "test": "test", "test-known": "train", "trials": "test", "grids": "test",
-    }  # fmt: skip
-    assert [name for name, run in shipped.runs.items() if run.is_of_grids] == ["grids"]
+    assert {run.objects for run in shipped.runs.values()} == {"test"}
+    assert [name for name, run in shipped.runs.items() if run.is_of_grids] == grids
+    assert [name for name, run in shipped.runs.items() if run.spec.scene.places is None] == ["tops"]
+    assert all(run.digests is not None for run in shipped.runs.values())
     assert [name for name, run in shipped.runs.items() if run.spec.label_source == "sim"] == ["trials"]
-    assert shipped.runs["test"].spec.objects != shipped.runs["test-known"].spec.objects
 
 
 def test_its_objects_are_the_division_of_the_real_ones(assets: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from datagen.train.models.hand_size import measured_hand
 from datagen.workers.motion import pose_reach as module
 from datagen.workers.motion.pose_reach import (
-    known_arms,
+    known_arm,
     measured_arm,
     pose_reach,
     reach_codes,
@@ -16,7 +16,7 @@ from datagen.workers.motion.pose_reach import (
     size_row,
 )
 from datagen.workers.robots import ROBOTS as NAMES
-from datagen.workers.robots import gripper_of, open_largest, open_robot
+from datagen.workers.robots import gripper_of, open_largest, open_robot, robot_digest
 from tests.sim_extra import needs_robots, needs_sim
 
 # An arm with axes along y, one without an upright first joint, and one whose base turns.
@@ -70,13 +70,15 @@ def test_poses_that_joints_attain_have_codes_and_far_ones_none(name: str, reach_
 @pytest.mark.parametrize("name", NAMES)
 def test_the_shipped_hands_and_maps_are_those_of_the_robots_files(name: str) -> None:
     """`python -m scripts.known_arms` writes them. Samples at borders may lie beyond them elsewhere."""
-    known, reaches_m = known_arms(), reaches_of(name)
-    np.testing.assert_array_equal(known[f"{name}/reach_m"], reaches_m)
-    np.testing.assert_allclose(known[f"{name}/hand"], measured_hand(gripper_of(name)), atol=1e-6)
+    digest, reaches_m = robot_digest(name), reaches_of(name)
+    known = known_arm(f"{name}@{digest}" if digest else name)
+    assert not known_arm(f"{name}@{'0' * 64}") and not known_arm("ur10.toml")
+    np.testing.assert_array_equal(known["reach_m"], reaches_m)
+    np.testing.assert_allclose(known["hand"], measured_hand(gripper_of(name)), atol=1e-6)
     for step in {0, len(reaches_m) - 1}:
         arm = measured_arm(name, float(reaches_m[step]))
-        np.testing.assert_allclose(known[f"{name}/size"][step], size_row(arm), atol=1e-6)
-        assert (known[f"{name}/code"] != arm.code).mean() < 1e-3
+        np.testing.assert_allclose(known["size"][step], size_row(arm), atol=1e-6)
+        assert (known["code"] != arm.code).mean() < 1e-3
 
 
 @needs_sim
@@ -87,7 +89,7 @@ def test_scores_without_the_robots_files_are_the_same(
     axes, xy, turn, rise = attained("panda-scaled", 1.0, 100)
     places = (axes, np.arange(100), xy, turn, rise)
     shipped = reach_codes(pose_reach.__wrapped__("panda-scaled", reach_m), *places)
-    monkeypatch.setattr(module, "known_arms", dict)
+    monkeypatch.setattr(module, "known_arm", lambda name: {})
     measured = reach_codes(pose_reach.__wrapped__("panda-scaled", reach_m), *places)
     np.testing.assert_array_equal(shipped, measured)
 
