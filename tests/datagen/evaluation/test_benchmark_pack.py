@@ -213,3 +213,13 @@ def test_a_pack_is_not_written_over_files_or_without_a_scene_a_run(
     refused([*words, str(small_benchmark)], capsys, "--out: is not empty")
     refused([*words, str(tmp_path / "new"), "--scenes", "1"], capsys, "--scenes: 1: is less than the 2 runs")
     assert not (tmp_path / "new").exists()
+
+
+def test_the_shipped_pack_is_of_the_shipped_benchmark_and_names_its_sources() -> None:
+    pack = benchmark.PACK
+    told, shipped = benchmark.read_benchmark(pack), benchmark.read_benchmark()
+    assert told.version == f"{shipped.version} pack of 98 scenes"
+    assert {name: run.spec for name, run in told.runs.items()} == {n: r.spec for n, r in shipped.runs.items()}
+    assert sum(path.stat().st_size for path in pack.iterdir()) < 4_000_000
+    text = (pack / "ATTRIBUTION.md").read_text("utf-8")
+    assert all(word in text for word in ("ProcTHOR", "Apache License 2.0", "YCB", "Attribution 4.0"))
