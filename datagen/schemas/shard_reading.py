@@ -51,15 +51,13 @@ class Source(Protocol):
     def chunks(self, wanted: Wanted) -> Iterator[tuple[str, bytes]]: ...
 
 
-class _Zipped:
+class _Zipped(Protocol):
     """A source whose files are in one zip."""
 
     @property
-    def url(self) -> str:
-        raise NotImplementedError
+    def url(self) -> str: ...
 
-    def _open(self) -> ZipFiles:
-        raise NotImplementedError
+    def _open(self) -> ZipFiles: ...
 
     def metadata(self, names: Sequence[str]) -> dict[str, StoredArray]:
         files, paths = self._open(), {name: f"{name}/zarr.json" for name in names}

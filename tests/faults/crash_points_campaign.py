@@ -234,9 +234,7 @@ def _judge(
             continue  # the account of a new attempt follows its commit, or comes with who resumes
         if value == new:
             states.add("there")
-        elif value == old or (
-            (old or "").startswith("refused") and (value or "refused").startswith("refused")
-        ):
+        elif value == old or ((old or "").startswith("refused") and value in (None, "refused: no such file")):
             states.add("absent")  # damaged before, and set aside: its object first, then its commit
         else:
             violated(f"{name} is {value!r}, was {old!r}, should be {new!r}")
