@@ -23,7 +23,6 @@ _NEXT_M = 1e-6  # between lines on one face
 _MOVES = 0.5  # pads are where the fingers move apart by at least this share of the most
 _LEAST_OPENING_M, _CENTRED_M = 0.005, 0.004
 _HALVINGS = 14
-_IN_PAD = np.linspace(0.0, 1.0, 9)  # where the pads' surfaces are measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +92,7 @@ class HandMeasures:
                 "only one finger moves" if len(roots) == 1 else "no fingers lie on both sides of the hand"
             )
             raise self._wrong("hand.fingers", problem, fix)
-        self._faces = [[ConvexHull(part).equations for part in parts] for parts in fingers.parts_m]
+        self._hulls = [[ConvexHull(part) for part in parts] for parts in fingers.parts_m]
 
     def _has_shapes(self, root: int) -> bool:
         return any(p for p, r in zip(self._fingers.parts_m, self._fingers.root, strict=True) if r == root)
@@ -147,9 +146,9 @@ class HandMeasures:
         T = self._poses(q)
         best, body = np.full(len(x), side * np.inf), np.zeros(len(x))
         for b in np.flatnonzero(self.side == side).tolist():
-            for faces in self._faces[b]:
-                n = faces[:, :3] @ T[b, :3, :3].T
-                rest = np.outer(x, n[:, 0]) + np.outer(z, n[:, 2]) + (faces[:, 3] - n @ T[b, :3, 3])
+            for hull in self._hulls[b]:
+                n = hull.equations[:, :3] @ T[b, :3, :3].T
+                rest = np.outer(x, n[:, 0]) + np.outer(z, n[:, 2]) + (hull.equations[:, 3] - n @ T[b, :3, 3])
                 is_flat = np.abs(n[:, 1]) < 1e-9
                 y = -rest / np.where(is_flat, 1.0, n[:, 1])
                 low = np.where((n[:, 1] < 0) & ~is_flat, y, -np.inf).max(axis=1)
@@ -159,6 +158,28 @@ class HandMeasures:
                 is_closer = near * side < best * side
                 best[is_closer], body[is_closer] = near[is_closer], b
         return np.column_stack([x, best, z, body])
+
+    def _nearest(self, q: float, side: int, low: F64, high: F64) -> float:
+        """The y of one side where it comes nearest to the other between the corners (3,) of a column along y.
+
+        Of a convex shape in a column that is on one of its edges, or where an edge of the column meets a face.
+        """
+        x, z = (grid.ravel() for grid in np.meshgrid(*zip(low[::2], high[::2], strict=True)))
+        found = [self._surface(q, side, x, z)[:, 1]]
+        T = self._poses(q)
+        for b in np.flatnonzero(self.side == side).tolist():
+            for hull in self._hulls[b]:
+                corners = hull.points[hull.simplices] @ T[b, :3, :3].T + T[b, :3, 3]  # (F, 3, 3)
+                start, along = corners, np.roll(corners, -1, axis=1) - corners
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    ends = np.stack([low - start, high - start])[..., ::2] / along[..., ::2]
+                # An edge in a side of the column is within it.
+                ends = np.where(np.isnan(ends), np.array([-np.inf, np.inf])[:, None, None, None], ends)
+                enter = np.maximum(np.min(ends, axis=0).max(axis=-1), 0.0)
+                leave = np.minimum(np.max(ends, axis=0).min(axis=-1), 1.0)
+                met = enter <= leave
+                found.extend(start[met][:, 1] + share[met] * along[met][:, 1] for share in (enter, leave))
+        return float(side * (side * np.concatenate(found)).min())
 
     def _pads(self) -> tuple[float, list[F64]]:
         """The coordinate at which the fingers meet, and points (P, 4) of both pads: x, y, z and body."""
@@ -224,11 +245,8 @@ class HandMeasures:
             middle = (moved.min(axis=0) + moved.max(axis=0)) / 2
             depth[k] = middle[2]
             # As far apart as a box of the pads' size fits between them.
-            ends = [
-                middle[axis] + size * (_IN_PAD - 0.5) for axis, size in zip((0, 2), pad_size_m, strict=True)
-            ]
-            x, z = (grid.ravel() for grid in np.meshgrid(*ends, indexing="ij"))
-            inner = [side * (side * self._surface(at, side, x, z)[:, 1]).min() for side in (1, -1)]
+            half = np.array([pad_size_m[0], np.inf, pad_size_m[1]]) / 2
+            inner = [self._nearest(at, side, middle - half, middle + half) for side in (1, -1)]
             opening[k] = max(inner[0] - inner[1], 0.0)
             if np.isfinite(inner).all() and abs(sum(inner)) / 2 > _CENTRED_M:
                 fix = "Correct hand.tcp, or name joints of both fingers in hand.fingers"

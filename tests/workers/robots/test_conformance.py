@@ -284,10 +284,8 @@ def test_the_hand_closes_on_a_box_of_each_width(robot: Robot) -> None:
     assert np.abs(np.diff(depths)).max() < 0.02
     poses = gripper.body_poses(openings)
     shapes = [[polyhedron(part) for part in parts] for parts in gripper.body_parts_m]
-    # Stretch's pads stand up to 10 degrees apart: where it is wide open, an end is 3 mm nearer.
-    narrower = -0.004 if robot.name == "stretch3" else -0.002
     for width, depth, T in zip(openings, depths, poses, strict=True):
-        for margin in (narrower, 0.002):
+        for margin in (-0.002, 0.002):
             size = np.array([gripper.pad_size_m[0], width + margin, gripper.pad_size_m[1]])
             corners = ((np.arange(8)[:, None] >> np.arange(3)) & 1) - 0.5
             box = polyhedron(corners * size)
