@@ -25,12 +25,14 @@ if TYPE_CHECKING:
     from datagen.tables.candidates import candidates
     from datagen.tables.dataset import open_dataset
     from datagen.train.prediction.frames import SensorFrame
+    from datagen.train.prediction.occupancy import OccupancyMap
     from datagen.train.prediction.predict import load_scorer
     from datagen.train.torch_stream import TorchStream, stream
 
 __all__ = [
     "InputError",
     "JobResult",
+    "OccupancyMap",
     "Run",
     "SensorFrame",
     "TorchStream",
@@ -65,6 +67,7 @@ _MODULES = {
     "datagen.tables.candidates": ("candidates",),
     "datagen.tables.dataset": ("open_dataset",),
     "datagen.train.prediction.frames": ("SensorFrame",),
+    "datagen.train.prediction.occupancy": ("OccupancyMap",),
     "datagen.train.prediction.predict": ("load_scorer",),
     "datagen.train.torch_stream": ("TorchStream", "stream"),
 }

@@ -41,9 +41,8 @@ def main(folder: Path) -> None:
         base_height=fetch.base_height_m[0],
         allow_unseen=True,  # the stored view is cut to 1 m around the target and shows little floor
     )
-    print(f"how sure: {answer.sure}")
+    print("; ".join([answer.level, *answer.reasons]))
     if answer.best is None:
-        print("no base pose around the target is free")
         return
     x, y = answer.base_xy_m[answer.best]
     yaw_deg = math.degrees(answer.yaw_rad[answer.best])

@@ -139,7 +139,7 @@ def demo_answer(scorer: ModelScorer) -> dict[str, Any]:
         "yaw_rad": float(answer.yaw_rad[best]),
         "score": float(answer.score[best]),
         "clear": len(answer.rows("clear")),
-        "sure": answer.sure,
+        "level": answer.level,
     }
 
 

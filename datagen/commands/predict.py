@@ -25,14 +25,16 @@ from datagen.workers.robots import robot_limits
 if TYPE_CHECKING:
     from datagen.train.prediction import Footprint, Prediction
     from datagen.train.prediction.frames import SensorFrame
+    from datagen.train.prediction.occupancy import OccupancyMap
     from datagen.train.scorers import Scorer
 
     Frames = Sequence[str | Path | SensorFrame]
+    Maps = Sequence[str | Path | OccupancyMap]
     Checkpoint = str | Path | Scorer
     Outline = str | float | Sequence[Sequence[float]] | Footprint
 else:
     # Types that the command line resolves without importing torch.
-    Prediction, Frames, Checkpoint, Outline = Any, Sequence[Path], str | Path, str
+    Prediction, Frames, Maps, Checkpoint, Outline = Any, Sequence[Path], Sequence[Path], str | Path, str
 
 T = TypeVar("T")
 _LARGEST_M = 10.0
@@ -48,7 +50,7 @@ def print_prediction(
     demo: bool = False,
     **_: Any,
 ) -> int:
-    """Print the best base pose; the exit code is 1 when no cell was seen to be clear."""
+    """Print the best base pose; the exit code is 1 where no clear one has a good score."""
     from datagen.train.prediction.prediction_report import document, report_rows
 
     if json:
@@ -101,6 +103,8 @@ class PredictOptions:
             [default: as trained]
         depth_scale: Metres per step of 16-bit depth.
         allow_unseen: Also consider cells of which the floor, or the way there, was not seen.
+        map: Map of the floor, map.yaml as Nav2 has it, in which the frames have their poses; repeatable.
+        keep_out: Map of which no base may stand on occupied cells, FILE.yaml.
         arrival: Arrival error to choose for: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv.
         out: Picture to write, FILE.png.
         html: Page to write, FILE.html.
@@ -123,6 +127,8 @@ class PredictOptions:
     footprint: Annotated[Outline | None, Parameter(converter=_text, n_tokens=1, metavar="STR")] = None
     depth_scale: float = 0.001
     allow_unseen: bool = False
+    map: Maps = ()
+    keep_out: Maps = ()
     arrival: str | None = None
     out: File | None = None
     html: File | None = None
@@ -151,15 +157,15 @@ def predict(given: PredictOptions) -> Prediction:
     A folder of a frame holds color.png, depth.png (16 bits), intrinsics.json (fx, fy, cx, cy, width, height),
     and optionally mask.png of the target and pose.json (T_world_camera, 4x4, floor at z = 0). The floor is
     known from the pose, from --gravity and --camera-height, or from the image and --camera-height. Exit code
-    1 when no cell was seen to be clear.
+    1 where no clear base pose has a good score.
 
     For example: datagen predict --base-height 0.7 --reach 0.85 --frame FRAME --out best.png
 
     Returns:
-        All poses. `best` is the row of the best clear one (None where none was seen to be clear),
-        `T_world_base(row)` and `T_camera_base(row)` are 4x4 poses of the arm's mount (x to the base's front),
-        `base_xy_m` (N, 2) and `yaw_rad` (N,) those of all rows, `score` (N,) their scores, and `sure` the
-        confidence in the answer. World is the frame of `T_world_camera` where frames have it, as a
+        All poses. `level` is "good", "doubtful" or "none", for `reasons`. `best` is the row of the best clear
+        pose (None where none has a good score), `T_world_base(row)` and `T_camera_base(row)` are 4x4 poses of
+        the arm's mount (x to the base's front), `base_xy_m` (N, 2) and `yaw_rad` (N,) those of all rows, and
+        `score` (N,) their scores. World is the frame of `T_world_camera` where frames have it, as a
         robot's map; else its origin is on the floor below the camera. A frame in Python may also be a
         SensorFrame.
 
@@ -176,7 +182,14 @@ def predict(given: PredictOptions) -> Prediction:
     """
     # Imported here: the libraries of training take seconds to import.
     from datagen.train.arrivals import read_arrival
-    from datagen.train.prediction import RobotSize, load_scorer, read_footprint, read_place
+    from datagen.train.prediction import (
+        KnownFloor,
+        RobotSize,
+        load_scorer,
+        read_footprint,
+        read_map,
+        read_place,
+    )
     from datagen.train.prediction import predict as scored
 
     if given.demo:
@@ -203,6 +216,10 @@ def predict(given: PredictOptions) -> Prediction:
     own_height = given.robot_camera_height or given.camera_height
     if own_height is None and frames and (pose := frames[0].T_world_camera) is not None:
         own_height = float(pose[2, 3])
+    maps, keep_out = (
+        tuple(read_map(Path(each)) if isinstance(each, (str, Path)) else each for each in given_maps)
+        for given_maps in (given.map, given.keep_out)
+    )
     scorer = given.checkpoint
     answer = scored(
         load_scorer(scorer) if scorer is None or isinstance(scorer, (str, Path)) else scorer,
@@ -213,6 +230,7 @@ def predict(given: PredictOptions) -> Prediction:
         click=given.click,
         allow_unseen=given.allow_unseen,
         arrival=error,
+        known=KnownFloor(maps, keep_out) if maps or keep_out else None,
     )
     if out is not None:
         from datagen.train.prediction.pictures import draw_prediction

@@ -13,10 +13,11 @@ from datagen.schemas.specification import CandidateParams
 from datagen.schemas.stored_arrays import facing_rad
 from datagen.train.arrivals import Arrival, expected_success, stands, tolerance_m
 from datagen.train.inputs import F32, F64, I64, Bools
-from datagen.train.prediction.floor_ways import CELL_M, WAYS, counted, draw_map, ways_to
+from datagen.train.prediction.floor_ways import CELL_M, WAYS, counted, draw_map, map_corners, ways_to
 from datagen.train.prediction.footprints import Footprint
 from datagen.train.prediction.fusing import SeenPoints
 from datagen.train.prediction.ground import depth_error_m, distances_m, floor_points
+from datagen.train.prediction.occupancy import KnownFloor
 from datagen.workers.bases.candidates import grid_offsets
 from datagen.workers.bases.clearance import STEP_M
 
@@ -68,14 +69,20 @@ def headings(offset_m: F32, robot: RobotSize) -> F64:
 
 
 def observe_cells(
-    seen: SeenPoints, center_m: F64, robot: RobotSize, params: CandidateParams, yaw_error_rad: float = 0.0
+    seen: SeenPoints,
+    center_m: F64,
+    robot: RobotSize,
+    params: CandidateParams,
+    yaw_error_rad: float = 0.0,
+    known: KnownFloor | None = None,
 ) -> BaseCells:
     """The grid around the target, each cell blocked, unreachable, unseen or clear, in this order.
 
     A cell is blocked where observed points lie in the base's outline between the floor and a board's
     thickness above the mount, or within the mast's radius from there to the camera. It is unreachable where
     no way leads there (`floor_ways`), and unseen where too little of the floor below it, or of the way, was
-    seen. A polygon must also fit where the base turns up to twice `yaw_error_rad` too far.
+    seen. A polygon must also fit where the base turns up to twice `yaw_error_rad` too far. Floor that is
+    `known` to be free counts as seen, and occupied floor as points there.
     """
     offsets, base = grid_offsets(params), robot.outline
     base_xy, yaw = center_m[:2] + offsets, headings(offsets.astype(np.float32), robot)
@@ -87,6 +94,10 @@ def observe_cells(
     low_points = seen.points_m[above & (z < mount + _BOARD_M)]
     tops = seen.points_m[above & (z >= mount) & (z < top)]
     floor = seen.points_m[is_floor]
+    if known is not None:
+        around = map_corners(base_xy, seen.eyes_m)
+        free, occupied = (np.insert(xy, 2, 0.0, axis=1).astype(np.float32) for xy in known.points(*around))
+        low_points, floor = np.concatenate([low_points, occupied]), np.concatenate([floor, free])
     high = _counts(tops, base_xy, yaw, Footprint(params.mast_radius_m))
     turns = (-2 * yaw_error_rad, 0.0, 2 * yaw_error_rad) if yaw_error_rad and base.corners_m else (0.0,)
     low = np.max([_counts(low_points, base_xy, yaw + turn, base) for turn in turns], axis=0)
@@ -178,7 +189,7 @@ def _floor_share(floor_m: F32, base_xy: F64, yaw: F64, base: Footprint) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The chosen base pose, as a row of the cells; None where none may be chosen."""
+    """The chosen base pose, as a row of the cells; None where none may be chosen or none scores well."""
 
     best: int | None
     nominal: int | None  # the row with the best score
@@ -191,14 +202,16 @@ def choose(
 ) -> Choice:
     """The best of the cells in an `allowed` state; with an arrival error by the mean score on arrival.
 
-    A robot that arrives where a base is in another state fails. Scores from `threshold` on are good; without
-    a threshold (nan) there is no `miss_m`.
+    A robot that arrives where a base is in another state fails. Scores from `threshold` on are good: where no
+    pose has one, none is best. Without a threshold (nan) there is no `miss_m`.
     """
     can_stand = np.isin(cells.state, [STATES.index(name) for name in allowed])
     rows = np.flatnonzero(can_stand)
     if not len(rows):
         return Choice(None, None, None, None)
     nominal = int(rows[np.argmax(score[rows])])
+    if score[nominal] < threshold:
+        return Choice(None, nominal, None, None)
     side = round(float(np.sqrt(len(score))))
     step_m = float(np.ptp(cells.offset_m[:, 0]) / (side - 1))
     value = stands(score, can_stand).reshape(side, side)

@@ -52,6 +52,13 @@ def read_mask(path: Path) -> Bools:
     return np.asarray(pixels.any(axis=2), np.bool_)
 
 
+def read_grey(path: Path) -> tuple[U8, U8 | None]:
+    """Grey values (H, W) of a PGM, PNG or BMP, and its opacity where it has one."""
+    image = _opened(path, ("PPM", "PNG", "BMP"), None)
+    alpha = np.asarray(image.getchannel("A"), np.uint8) if image.mode in ("LA", "RGBA") else None
+    return np.asarray(image.convert("L"), np.uint8), alpha
+
+
 def read_depth(path: Path, depth_scale_m: float) -> F32:
     """Depth (H, W) along the camera's z axis, of a 16-bit PNG; 0 where nothing was measured."""
     image = _opened(path, ("PNG",), None)

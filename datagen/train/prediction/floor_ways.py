@@ -59,10 +59,7 @@ def draw_map(base_xy_m: F64, eyes_m: F64, low_points_m: F32, mast_points_m: F32,
 
     Points (M, 3) are those of obstacles below the mount, of obstacles above it, and of floor.
     """
-    middle = base_xy_m.mean(axis=0)
-    near = eyes_m[np.linalg.norm(eyes_m[:, :2] - middle, axis=1) < _EYE_M, :2]
-    around = np.concatenate([base_xy_m, near])
-    low, high = around.min(axis=0) - _MARGIN_M, around.max(axis=0) + _MARGIN_M
+    low, high = map_corners(base_xy_m, eyes_m)
     size = (int(np.ceil((high[0] - low[0]) / CELL_M)), int(np.ceil((high[1] - low[1]) / CELL_M)))
     # Far away, rows of pixels are farther apart than cells are wide.
     floor = ndimage.binary_closing(counted(floor_m, low, CELL_M, size) > 0)
@@ -72,6 +69,14 @@ def draw_map(base_xy_m: F64, eyes_m: F64, low_points_m: F32, mast_points_m: F32,
         _crowded(mast_points_m, low, size),
         np.asarray(floor, np.bool_),
     )
+
+
+def map_corners(base_xy_m: F64, eyes_m: F64) -> tuple[F64, F64]:
+    """The corners (2,) of the map around base positions (N, 2) and cameras (F, 3)."""
+    middle = base_xy_m.mean(axis=0)
+    near = eyes_m[np.linalg.norm(eyes_m[:, :2] - middle, axis=1) < _EYE_M, :2]
+    around = np.concatenate([base_xy_m, near])
+    return around.min(axis=0) - _MARGIN_M, around.max(axis=0) + _MARGIN_M
 
 
 def ways_to(

@@ -30,11 +30,13 @@ _LOOK: dict[str, tuple[Any, float, str]] = {
     UNREACHABLE: (0.42 * _DIAMOND, 0.9, "none"),
 }
 _MOST_POINTS = 6_000
+_MAP_COLOURS = ("#e8eef4", "#4a4a4a")  # of free and of occupied floor
 
 
 def draw_prediction(prediction: Prediction, out: IO[bytes]) -> None:
     """Write the picture as PNG: frame and answer on the left, the plan on the right."""
-    title = textwrap.fill(f"Base poses scored by {prediction.scorer}: {prediction.sure}", 80)
+    said = "; ".join((prediction.level, *prediction.reasons))
+    title = textwrap.fill(f"Base poses scored by {prediction.scorer}: {said}", 80)
     figure = new_sheet(title, 7.0)
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(1, 1.15))).tolist()
     frame, facts = left.subplots(2, 1, height_ratios=(1, 1.05))
@@ -62,6 +64,10 @@ def shown_rows(prediction: Prediction, most: int, around_m: float) -> I64:
 def _draw_plan(axes: Axes, prediction: Prediction, scale: ScalarMappable) -> None:
     offset_m, centre = prediction.cells.offset_m, prediction.center_m
     half_m, side_m = float(np.abs(offset_m).max()) + 0.35, float(np.diff(np.unique(offset_m[:, 0])[:2])[0])
+    if prediction.known is not None:
+        known = prediction.known.points(centre[:2] - half_m, centre[:2] + half_m)
+        for xy, colour in zip(known, _MAP_COLOURS, strict=True):
+            axes.scatter(*xy.T, s=4, c=colour, lw=0, marker="s", zorder=0)
     rows = shown_rows(prediction, _MOST_POINTS, half_m)
     rows = rows[np.argsort(prediction.seen.points_m[rows, 2])]  # higher points hide lower ones
     x, y, _ = prediction.seen.points_m[rows].T

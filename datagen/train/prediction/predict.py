@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from datagen.train.prediction.base_cells import (
 from datagen.train.prediction.frames import SensorFrame, image_frame
 from datagen.train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
 from datagen.train.prediction.ground import Ground, find_ground
+from datagen.train.prediction.occupancy import KnownFloor
 from datagen.train.prediction.region_growing import grow_mask
 from datagen.train.prediction.target import Filled, TargetBox, fill_target, locate
 from datagen.train.prediction.trained_robots import robot_notes, trained_robots
@@ -41,6 +43,8 @@ from datagen.workers.rendering.cloud import Cloud
 # The margin is to this rank: neighbours of the best have nearly its score.
 _RANK = 10
 _SURE, _LIKELY = 0.8, 0.5
+# Robots stop that far from their goals; less of the surroundings seen than this share says little.
+_LEAST_MISS_M, _LEAST_SEEN = 0.05, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +63,13 @@ class Prediction:
     score: F64  # (N,)
     choice: Choice
     arrival: Arrival | None
+    known: KnownFloor | None
+    doubts: tuple[str, ...]  # about the robot: its sizes, and whether its hand can hold the target
     notes: tuple[str, ...]
 
     @property
     def best(self) -> int | None:
-        """Row of the best allowed base pose; None where there is none."""
+        """Row of the best allowed base pose; None where there is none, or none with a good score."""
         return self.choice.best
 
     @property
@@ -120,32 +126,36 @@ class Prediction:
         return float(np.mean(shares)) if shares else None
 
     @property
-    def sure(self) -> str:
-        """Confidence in the answer, as text."""
+    def level(self) -> Literal["good", "doubtful", "none"]:
+        """Whether to drive there: "none" without a best pose, "doubtful" where `reasons` speak against it."""
+        return "none" if self.best is None else "doubtful" if self.reasons else "good"
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why the answer is no better than it is; empty for a good one."""
+        nominal, unseen = self.choice.nominal, self.rows(UNSEEN)
         if self.best is None:
-            hint = "; unseen ones are left, show their floor in more frames" if len(self.rows(UNSEEN)) else ""
-            return f"no answer: no clear base pose was observed around the target{hint}"
-        score, thin = float(self.score[self.best]), self.target_points < _CROP.min_target_points
-        if score < _LIKELY:
-            unseen = self.rows(UNSEEN)
-            better = len(unseen) > 0 and float(self.score[unseen[0]]) >= _LIKELY
-            return "doubtful: even the best base pose has a low score" + (
-                "; some whose floor is not visible score higher" if better else ""
-            )
-        if self.cells.state[self.best] == STATES.index(UNSEEN):
-            return "good if the floor there and on the way is free, which is not visible"
-        doubt = any(ground.doubt is not None for ground in self.grounds)
-        if score < _SURE or thin or doubt or self.crop_seen < 0.1:
-            return "likely: " + (
-                "a medium score"
-                if score < _SURE
-                else "the floor is uncertain"
-                if doubt
-                else "few points of the target"
-                if thin
-                else "few surroundings were observed"
-            )
-        return "high, by the scores"
+            reasons = ["no clear base pose was observed around the target"]
+            if nominal is not None:
+                reasons = [f"the highest score of a clear base pose is only {self.score[nominal]:.3f}"]
+            if len(unseen) and (nominal is None or self.score[unseen[0]] >= _LIKELY):
+                reasons.append("unseen ones are left: show their floor in more frames")
+            return tuple(reasons)
+        score, expected, miss_m = self.score[self.best], self.choice.expected, self.choice.miss_m
+        doubts = {
+            f"a medium score, {score:.3f}": score < _SURE,
+            "the floor there or on the way is not visible": self.cells.state[self.best]
+            == STATES.index(UNSEEN),
+            f"scores stay good only within {miss_m or 0.0:.2f} m of it": expected is None
+            and miss_m is not None
+            and miss_m < _LEAST_MISS_M,
+            "with the arrival error, failure is likelier than success": expected is not None
+            and expected[self.best] < _LIKELY,
+            "the floor is uncertain": any(ground.doubt is not None for ground in self.grounds),
+            "few points of the target": self.target_points < _CROP.min_target_points,
+            "few surroundings were observed": self.crop_seen < _LEAST_SEEN,
+        }
+        return (*(reason for reason, holds in doubts.items() if holds), *self.doubts)
 
 
 _CROP = ObservationParams()
@@ -191,6 +201,7 @@ def predict(
     target_center_m: F64 | None = None,
     allow_unseen: bool = False,
     arrival: Arrival | None = None,
+    known: KnownFloor | None = None,
     grid: int = 25,
     half_width_m: float = 1.0,
     seed: int = 0,
@@ -201,11 +212,15 @@ def predict(
     `gravity` (3,), in its frame, or the floor in sight it gives the pose of a frame that has none.
     The target is given by masks, by one click into the first frame, or by a cloud's own marks;
     `target_center_m` (3,), world, replaces the estimated centre. With an `arrival` error the best is the cell
-    with the highest expected success. InputError where arguments are missing or invalid.
+    with the highest expected success. A map of the floor that is `known` is in the frame of the poses of the
+    frames. InputError where arguments are missing or invalid.
     """
     if isinstance(scorer, ModelScorer):
         side_deg = 0.0 - math.degrees(robot.yaw_rad)
         refuse_other_heading("datagen predict", "--robot", side_deg, scorer.name, scorer.side_deg)
+    if known is not None and any(frame.T_world_camera is None for frame in frames):
+        fix = "Give its frames T_world_camera in the map: pose.json in a folder, or in the .npz"
+        raise InputError("--map", "", "says nothing of frames without a pose", fix)
     grounds = _grounds(frames, camera_height_m, gravity)
     frames = _with_target(frames, grounds, click)
     prepared, filled = _fill(frames)
@@ -221,14 +236,28 @@ def predict(
     centre = np.array(target.center_m)
     cloud = crop_cloud(seen, centre, _CROP, np.random.default_rng(seed))
     yaw_rad = 0.0 if arrival is None else arrival.yaw_std_rad
-    cells = observe_cells(seen, centre, robot, _grid(grid, half_width_m), yaw_rad)
+    cells = observe_cells(seen, centre, robot, _grid(grid, half_width_m), yaw_rad, known)
     score = scored(scorer, _batch(cloud, target, robot, cells))
     allowed = (CLEAR, UNSEEN) if allow_unseen else (CLEAR,)
     seen_from_goal = None if arrival is None else arrival.turned(robot.yaw_rad)
     choice = choose(score, cells, allowed, scorer.threshold, seen_from_goal)
-    notes = (*_notes(grounds, filled, cloud), *robot_notes(scorer, robot))
-    given = (scorer.name, robot, tuple(frames), tuple(grounds))
-    return Prediction(*given, seen, target, filled, cloud, cells, score, choice, arrival, notes)
+    doubts = (*robot_notes(scorer, robot), *_hand_doubts(target, robot))
+    given = (scorer.name, robot, tuple(frames), tuple(grounds), seen, target, filled, cloud, cells)
+    return Prediction(*given, score, choice, arrival, known, doubts, _notes(grounds, filled, cloud))
+
+
+def _hand_doubts(target: TargetBox, robot: RobotSize) -> tuple[str, ...]:
+    # Imported here: needs the compiler.
+    from datagen.train.models.hand_reach import UNKNOWN_ROBOT
+    from datagen.train.models.hand_size import hand_size
+
+    opens_m = hand_size(robot.name or UNKNOWN_ROBOT).stroke_m
+    if target.narrowest_m <= opens_m:
+        return ()
+    size = (
+        f"all sides of the target are at least {target.narrowest_m:.2f} m, and the hand opens {opens_m:.2f} m"
+    )
+    return (f"{size}: only a rim or a handle could be held",)
 
 
 def _grounds(

@@ -23,7 +23,10 @@ def _world_axes(prediction: Prediction) -> str:
 def report_rows(prediction: Prediction) -> list[tuple[str, str]]:
     """The answer as rows of a heading and a text."""
     p, robot, floor, unseen = prediction, prediction.robot, prediction.grounds[0], prediction.rows("unseen")
-    rows = [("best", "none" if p.best is None else _described(p, p.best)), ("sure", p.sure)]
+    rows = [
+        ("best", "none" if p.best is None else _described(p, p.best)),
+        ("answer", "; ".join((p.level, *p.reasons))),
+    ]
     nominal = p.choice.nominal
     if p.choice.expected is not None and p.arrival is not None and p.best is not None and nominal is not None:
         text = f"{p.arrival.text}; expected success {p.choice.expected[p.best]:.3f}"
@@ -61,7 +64,8 @@ def document(prediction: Prediction) -> dict[str, Any]:
     pixels = {} if p.filled is None else asdict(p.filled)
     return {
         "scorer": p.scorer,
-        "sure": p.sure,
+        "level": p.level,
+        "reasons": list(p.reasons),
         "notes": list(p.notes),
         "world": _world_axes(p),
         "best": None if p.best is None else _pose(p, p.best),

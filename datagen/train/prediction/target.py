@@ -25,6 +25,7 @@ class TargetBox:
     center_m: tuple[float, float, float]
     radius_m: float  # the sphere around the centre that holds the target
     support_height_m: float  # of the surface that it stands on
+    narrowest_m: float  # the least of its height and its widths as seen from above
     how: str
 
 
@@ -99,7 +100,15 @@ def locate(target_m: F64, others_m: F64, eye_m: F64) -> TargetBox:
         f"{top - support:.3f} m over a support at {support:.3f} m"
     )
     x, y, z = (float(c) for c in centre)
-    return TargetBox((x, y, z), radius_m, support, how)
+    narrowest_m = min(_least_width_m(kept[:, :2], centre_xy), float(top - support))
+    return TargetBox((x, y, z), radius_m, support, narrowest_m, how)
+
+
+def _least_width_m(xy_m: F64, centre_xy_m: F64) -> float:
+    """The least width of points (N, 2) and their copy turned by half a turn about the centre (2,)."""
+    angle = np.linspace(0.0, np.pi, 36, endpoint=False)
+    along = (xy_m - centre_xy_m) @ np.stack([np.cos(angle), np.sin(angle)])
+    return float(2 * np.percentile(np.abs(along), 100 - _RIM_PERCENT, axis=0).min())
 
 
 def _support_under(others_m: F64, middle_xy: F64, half_m: float, low_m: float) -> float:

@@ -162,7 +162,7 @@ class HandMeasures:
     def _nearest(self, q: float, side: int, low: F64, high: F64) -> float:
         """The y of one side where it comes nearest to the other between the corners (3,) of a column along y.
 
-        Of a convex shape in a column that is on one of its edges, or where an edge of the column meets a face.
+        Of a convex shape, that is on one of its edges, or where an edge of the column meets a face.
         """
         x, z = (grid.ravel() for grid in np.meshgrid(*zip(low[::2], high[::2], strict=True)))
         found = [self._surface(q, side, x, z)[:, 1]]

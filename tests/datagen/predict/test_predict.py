@@ -159,7 +159,16 @@ def test_a_model_that_knows_kinematics_scores_the_named_robot(
 def test_a_frame_without_a_clear_place_ends_with_1(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(arguments(made, "--footprint", "2")) == 1
     told = capsys.readouterr().out
-    assert "no answer" in told and "0 clear" in told
+    assert "none; no clear base pose was observed" in told and "0 clear" in told
+
+
+def test_a_low_score_is_no_answer(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_untrained(tmp_path / "model.ckpt", MODEL, logit=-3.0)
+    line = arguments(made)
+    assert cli.run([line[0], str(tmp_path / "model.ckpt"), *line[2:], "--json"]) == 1
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["best"] is None and answer["level"] == "none"
+    assert re.fullmatch(r"the highest score of a clear base pose is only 0\.0\d\d", answer["reasons"][0])
 
 
 @pytest.mark.parametrize("json_too", [False, True])

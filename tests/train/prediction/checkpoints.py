@@ -16,8 +16,8 @@ from datagen.train.models import build_model
 from datagen.train.training.checkpoints import Checkpoint, CheckpointHead, write_checkpoint
 
 
-def write_untrained(file: Path, config: Mapping[str, Any]) -> None:
-    """The same parameters each time."""
+def write_untrained(file: Path, config: Mapping[str, Any], logit: float = 1.0) -> None:
+    """The same parameters each time; scores are near that of the logit."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(5)
         model = build_model("shared", config)
@@ -25,7 +25,9 @@ def write_untrained(file: Path, config: Mapping[str, Any]) -> None:
         model="shared", model_config=model.config, stage="stage1", options={}, data=(), val_data=(),
         house_ids=(), object_digests=(), val_house_ids=(), cost={}, versions={}, history=(),
     )  # fmt: skip
-    write_checkpoint(file, Checkpoint(head, model.state_dict()))
+    weights = dict(model.state_dict())
+    last = list(weights)[-1]
+    write_checkpoint(file, Checkpoint(head, weights | {last: weights[last] + torch.tensor([0.0, logit])}))
 
 
 def document_of(path: Path) -> dict[str, Any]:

@@ -15,12 +15,13 @@ from datagen.train.baselines.rules import Analytic
 from datagen.train.inputs import Array, Batch
 from datagen.train.prediction import RobotSize, predict
 from datagen.train.prediction.base_cells import STATES
+from datagen.train.prediction.frames import SensorFrame
 from datagen.train.prediction.ground import level_pose
 from datagen.train.prediction.predict import Prediction
 from datagen.train.scorers import ModelScorer, Scorer
 from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.geometry.transforms import yaw_pose
+from datagen.workers.geometry.transforms import look_at, yaw_pose
 from tests.train.prediction.checkpoints import write_untrained
 from tests.train.prediction.seen_scenes import MODEL, Seen, draw_seen, sensor_frame, write_frame
 
@@ -220,9 +221,30 @@ def test_unseen_base_poses_are_chosen_only_with_allow_unseen(seen: Seen, scorer:
         table, points_m=table.points_m[low], rgb=table.rgb[low], on_target=table.on_target[low], image=None
     )
     strict, lax = of(scorer, frame), of(scorer, frame, allow_unseen=True)
-    assert strict.best is None and strict.margin is None and "no answer" in strict.sure
+    assert strict.best is None and strict.margin is None and strict.level == "none"
+    assert strict.reasons[0] == "no clear base pose was observed around the target"
     assert lax.best is not None and lax.best == strict.rows("unseen")[0]
-    assert "not visible" in lax.sure
+    assert lax.level == "doubtful" and any("not visible" in reason for reason in lax.reasons)
+
+
+@pytest.mark.parametrize(("side_m", "is_held"), [(0.06, True), (0.16, False)])
+def test_a_cube_wider_than_the_hand_opens_is_doubtful(
+    scorer: ModelScorer, side_m: float, is_held: bool
+) -> None:
+    rng = np.random.default_rng(0)
+    faces = rng.uniform(0, side_m, (3, 1500, 3))
+    for axis, face in enumerate(faces):
+        face[:, axis] = 0.0 if axis < 2 else side_m  # as seen from (-1, -1, 1)
+    cube = np.concatenate(faces) + [0.0, 0.0, 0.7]
+    table = np.column_stack([rng.uniform(-0.3, 0.5, (4000, 2)), np.full(4000, 0.7)])
+    T = look_at(np.array([-0.7, -0.7, 1.3]), np.array([0.0, 0.0, 0.7]))
+    points = (np.concatenate([cube, table]) - T[:3, 3]) @ T[:3, :3]
+    on_target = np.arange(len(points)) < len(cube)
+    grey = np.full(points.shape, 128, np.uint8)
+    frame = SensorFrame("cube", points.astype(np.float32), grey, on_target, T, None)
+    answer = of(scorer, frame, allow_unseen=True)
+    assert answer.target.narrowest_m == pytest.approx(side_m, abs=0.015)
+    assert any("only a rim or a handle" in reason for reason in answer.reasons) != is_held
 
 
 def test_missing_depth_on_the_target_is_filled_and_reported(seen: Seen, scorer: ModelScorer) -> None:
