@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.train.models.hand_size import measured_hand
+from datagen.train.hands.sizes import measured_hand
 from datagen.workers.motion import pose_reach as module
 from datagen.workers.motion.pose_reach import (
     known_arm,
