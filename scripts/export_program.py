@@ -18,6 +18,7 @@ from safetensors.numpy import save
 from torch import Tensor, nn
 from torch.fx import Node
 
+from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import whole_file
 from datagen.train.hands.poses import HAND_WIDTH
 from datagen.train.hands.reach import N_STAGES
@@ -126,10 +127,11 @@ def _operation(node: Node) -> str:
 
 
 def write_program(checkpoint: Path, out: Path) -> None:
-    """Write the program of a checkpoint. ValueError for a model without kinematics or visibility."""
+    """Write the program of a checkpoint. InputError for a model without kinematics or visibility."""
     model, head = load_model(checkpoint)
     if not isinstance(model, SharedModel) or not (model.sizes.kinematics and model.sizes.observed_visibility):
-        raise ValueError("only `shared` with kinematics and visibility has a program")
+        fix = "Train `shared` with --model-config kinematics=true"
+        raise InputError(checkpoint, "model", "has no program of NumPy's operations", fix)
     model.eval()
     k, u8 = model.sizes.hand_poses, torch.uint8
     cloud = (torch.zeros(1, POINTS, 3), torch.zeros(1, POINTS, 3, dtype=u8), torch.zeros(1, POINTS).bool())

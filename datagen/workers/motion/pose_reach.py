@@ -92,7 +92,8 @@ def reach_codes(arm: PoseReach, axes: F64, pose_row: Ints, base_xy_m: F64, turn_
     for start in range(0, len(pose_row), _AT_ONCE):
         some = slice(start, start + _AT_ONCE)
         given = (pose_row[some], base_xy_m[some], turn_rad[some], rise_m[some])
-        found[some] = _look_up(arm, axes, *given)
+        with np.errstate(invalid="ignore"):  # poses that are not finite have no cells
+            found[some] = _look_up(arm, axes, *given)
     return found
 
 
