@@ -11,6 +11,7 @@ import json
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -45,16 +46,23 @@ class Function:
         """All results, constants and inputs that it uses."""
         return {name for step in self.steps for name in _named(step)} | set(self.outputs)
 
-    def run(self, constants: Mapping[str, Array], inputs: Mapping[str, Array]) -> list[Array]:
-        """The outputs for inputs by name. Results that nothing needs any more are dropped."""
-        known: dict[str, Any] = {**constants, **inputs}
+    @cached_property
+    def _dropped(self) -> list[set[str]]:
+        """What no step after each one needs: its own results and inputs, but neither constants nor outputs."""
         last = {name: k for k, step in enumerate(self.steps) for name in _named(step)}
-        for k, step in enumerate(self.steps):
-            args, options = _filled(step.args, known), _filled(step.options, known)
-            known[step.name] = OPERATIONS[step.op](*args, **options)
-            for name in _named(step):
-                if last[name] == k and name not in self.outputs and name not in constants:
-                    del known[name]
+        own = {step.name for step in self.steps} | set(self.inputs)
+        dropped = [set[str]() for _ in self.steps]
+        for name in own & last.keys() - set(self.outputs):
+            dropped[last[name]].add(name)
+        return dropped
+
+    def run(self, constants: Mapping[str, Array], inputs: Mapping[str, Array]) -> list[Array]:
+        """The outputs for inputs by name."""
+        known: dict[str, Any] = {**constants, **inputs}
+        for step, dropped in zip(self.steps, self._dropped, strict=True):
+            known[step.name] = OPERATIONS[step.op](*_filled(step.args, known), **_filled(step.options, known))
+            for name in dropped:
+                del known[name]
         return [known[name] for name in self.outputs]
 
 
