@@ -48,7 +48,7 @@ class Function:
 
     @cached_property
     def _dropped(self) -> list[set[str]]:
-        """What no step after each one needs: its own results and inputs, but neither constants nor outputs."""
+        """What no step after each one needs, of results and inputs that are no outputs."""
         last = {name: k for k, step in enumerate(self.steps) for name in _named(step)}
         own = {step.name for step in self.steps} | set(self.inputs)
         dropped = [set[str]() for _ in self.steps]
