@@ -112,7 +112,7 @@ class PredictOptions:
         map: Map of the floor, map.yaml as Nav2 has it, in which the frames have their poses; repeatable.
         keep_out: Map of which no base may stand on occupied cells, FILE.yaml.
         arrival: Arrival error to choose for: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv.
-        out: Picture to write, FILE.png.
+        out: Picture to write, FILE.png, .pdf or .svg.
         html: Page to write, FILE.html.
     """
 
@@ -242,7 +242,7 @@ def predict(given: PredictOptions) -> Prediction:
         from datagen.train.prediction.pictures import draw_prediction
 
         with whole_file(out, alone=True) as file:
-            draw_prediction(answer, file)
+            draw_prediction(answer, file, out.suffix.lower())
     if html is not None:
         from datagen.train.prediction.page import page_of
 
@@ -290,10 +290,10 @@ def _refuse_outputs(out: Path | None, html: Path | None, frames: Sequence[Any]) 
     read = {
         (path / name).resolve() for path in frames if isinstance(path, Path) for name in (RGB, DEPTH, MASK)
     }
-    for option, file, suffix in (("--out", out, ".png"), ("--html", html, ".html")):
+    for option, file, endings in (("--out", out, (".png", ".pdf", ".svg")), ("--html", html, (".html",))):
         if file is None:
             continue
-        refuse_output(file, option, suffix)
+        refuse_output(file, option, *endings)
         if file.is_dir() or file.resolve() in read:
             problem = "is a folder" if file.is_dir() else "is a picture of the frame"
             raise InputError(file, option, problem, "Give another name")
