@@ -27,9 +27,9 @@ def test_arrays_give_the_answer_of_their_files(seen: Seen, made: Path) -> None:
     filed = datagen.predict(frame=[made / "posed"], **SIZES)
     np.testing.assert_allclose(answer.score, filed.score, atol=1e-6)
     assert answer.best == filed.best is not None
-    metres = np.where(depth > 0, depth / 1000, np.nan)
+    metres = np.where(depth > 0, depth.astype(np.float32) * np.float32(0.001), np.float32(np.nan))
     again = datagen.find_base(rgb, metres, K, T, mask=mask, **SIZES)
-    np.testing.assert_allclose(again.score, answer.score, atol=1e-4)  # rounded otherwise
+    np.testing.assert_allclose(again.score, answer.score, atol=1e-6)
     assert repr(answer).startswith(f"Prediction({answer.level}: x ") and len(repr(answer)) < 100
     assert Image.open(BytesIO(answer._repr_png_())).size[0] > 500
 
