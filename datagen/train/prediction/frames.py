@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+import re
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -12,36 +15,31 @@ from scipy import ndimage
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import F32, F64, I64, U8, Bools
 from datagen.train.prediction.files import (
-    MAX_PIXELS,
+    checked_depth,
     checked_pose,
     read_arrays,
     read_depth,
-    read_intrinsics,
     read_mask,
     read_pose,
     read_rgb,
-    valid_depth,
+    scaled_depth,
 )
+from datagen.train.prediction.intrinsics import Pinhole, read_intrinsics
+from datagen.train.prediction.pcd import read_pcd
 from datagen.train.prediction.ply import read_ply
 
-DEPTH_SCALE_M = 0.001
-# Files of a folder that holds one frame.
-RGB, DEPTH, INTRINSICS, MASK, POSE = "color.png", "depth.png", "intrinsics.json", "mask.png", "pose.json"
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """Intrinsics in pixels. Pixel (u, v) has its centre at (u, v), as cameras and OpenCV have it."""
-
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-
-    def points(self, u: I64, v: I64, depth_m: F32) -> F32:
-        """Points (N, 3) in the camera's frame, of pixels (N,) with their depths (N,)."""
-        x, y = (u - self.cx_px) / self.fx_px, (v - self.cy_px) / self.fy_px
-        return (np.stack([x, y, np.ones(len(u))], axis=1) * depth_m[:, None]).astype(np.float32)
+# Of each file of a frame's folder: ends of its name before the dot, and the endings; the first is the usual one.
+_FILES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "color": (("color", "colour", "rgb", "image"), ("png", "jpg", "jpeg", "tif", "tiff", "ppm")),
+    "depth": (("depth",), ("png", "tif", "tiff", "pgm", "npy", "npz")),
+    "intrinsics": (
+        ("intrinsics", "intrinsic", "camerainfo", "camera", "calibration", "calib", "k"),
+        ("json", "yaml", "yml", "txt"),
+    ),
+    "mask": (("mask",), ("png",)),
+    "pose": (("pose",), ("json",)),
+}
+_LISTED, _MOST_LISTED = 12, 10_000  # files of a folder that an error names, and that are looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +50,31 @@ class RgbdImage:
     depth_m: F32  # (H, W), along the camera's z axis
     pinhole: Pinhole
     mask: Bools | None  # (H, W), the target's pixels
+    # Where it was undistorted: flat index (H, W) of each pixel in the picture that was given, -1 for none.
+    source: I64 | None = None
+    step_m: float | None = None  # of depth that is stored as whole numbers
+    notes: tuple[str, ...] = ()  # on how the files were read, for the answer
 
     def points(self, pixels: I64, depth_m: F32 | None = None) -> F32:
         """Points (N, 3) in the camera's frame, of flat pixel indices (N,)."""
         v, u = np.divmod(pixels, self.depth_m.shape[1])
         return self.pinhole.points(u, v, (self.depth_m if depth_m is None else depth_m).ravel()[pixels])
+
+    def undistorted(self, source: I64) -> RgbdImage:
+        """The picture of an ideal pinhole; `source` as above. Depth is the nearest pixel's, never a mean."""
+        inside, flat = source >= 0, np.maximum(source, 0)
+        rgb = self.rgb.reshape(-1, 3)[flat] * inside[..., None]
+        mask = None if self.mask is None else self.mask.ravel()[flat] & inside
+        return replace(self, rgb=rgb, depth_m=self.depth_m.ravel()[flat] * inside, mask=mask, source=source)
+
+    def pixel_of(self, u: int, v: int) -> tuple[int, int]:
+        """Where pixel (u, v) of the picture that was given lies in this one."""
+        if self.source is None:
+            return u, v
+        rows, columns = np.divmod(self.source, self.source.shape[1])
+        gap = np.where(self.source >= 0, (rows - v) ** 2 + (columns - u) ** 2, np.iinfo(np.int64).max)
+        row, column = divmod(int(gap.argmin()), self.source.shape[1])
+        return column, row
 
     def cut(self, left: int, top: int, right: int, bottom: int) -> RgbdImage:
         """The part of the picture between these columns and rows, with its pinhole."""
@@ -109,53 +127,122 @@ def read_frame(
     *,
     mask: str | Path | None = None,
     pose: str | Path | None = None,
-    depth_scale_m: float = DEPTH_SCALE_M,
+    depth_scale: float | None = None,
 ) -> SensorFrame:
-    """A frame of two aligned images and a JSON file of intrinsics. InputError for bad or unequal files."""
-    colour, depth_m = read_rgb(Path(rgb)), read_depth(Path(depth), depth_scale_m)
-    fx, fy, cx, cy, width, height = read_intrinsics(Path(intrinsics))
+    """A frame of two aligned images and a file of intrinsics, undistorted. InputError for bad or unequal files.
+
+    `depth_scale` is in metres a step below 1, else in steps a metre; None chooses it by the depth image.
+    """
+    colour, stored = read_rgb(Path(rgb)), read_depth(Path(depth))
+    camera = read_intrinsics(Path(intrinsics))
     chosen = None if mask is None else read_mask(Path(mask))
-    if (height, width) != depth_m.shape:
-        problem = f"is {width}x{height}, but the depth image has {_size(depth_m)}"
+    height, width = stored.shape
+    if camera.size_px not in (None, (width, height)):
+        problem = f"is {camera.size_px[0]}x{camera.size_px[1]}, but the depth image has {_size(stored)}"
         raise InputError(intrinsics, "width, height", problem, "Give the intrinsics of this stream")
     T = None if pose is None else read_pose(Path(pose))
-    image = RgbdImage(colour, depth_m, Pinhole(fx, fy, cx, cy), chosen)
-    return image_frame(image, T, {"rgb": str(rgb), "depth": str(depth), "mask": str(mask)})
+    image = _scaled(
+        RgbdImage(colour, np.empty(0, np.float32), camera.pinhole, chosen), stored, depth_scale, str(depth)
+    )
+    sources = {"rgb": str(rgb), "depth": str(depth), "mask": str(mask)}
+    _refuse_sizes(image, sources)
+    if (source := camera.source_pixels(height, width)) is not None:
+        note = f"lens distortion ({camera.model or 'Brown-Conrady'}) was undone"
+        image = replace(image.undistorted(source), notes=(*image.notes, note))
+    return image_frame(image, T, sources)
 
 
-def read_place(place: str | Path, depth_scale_m: float = DEPTH_SCALE_M) -> SensorFrame:
-    """The frame of a folder, of an .npz archive or of a .ply cloud.
+def read_place(place: str | Path, depth_scale: float | None = None) -> SensorFrame:
+    """The frame of a folder, of an .npz archive or of a .ply or .pcd cloud; `depth_scale` as for `read_frame`.
 
-    A folder holds color.png, depth.png, intrinsics.json, and optionally mask.png and pose.json.
+    A folder holds a colour and a depth image, intrinsics, and optionally a mask and a pose, by usual names.
     """
     path = Path(place)
     match path.suffix.lower():
         case ".npz":
-            return _npz_frame(path, depth_scale_m)
-        case ".ply":
-            cloud = read_ply(path)
+            return _npz_frame(path, depth_scale)
+        case ".ply" | ".pcd":
+            cloud = read_ply(path) if path.suffix.lower() == ".ply" else read_pcd(path)
             return SensorFrame(str(path), cloud.points_m, cloud.rgb, cloud.on_target, None, None)
         case _ if path.is_dir():
-            more = [path / name if (path / name).exists() else None for name in (MASK, POSE)]
-            files = (path / RGB, path / DEPTH, path / INTRINSICS)
-            for file in files:
-                if not file.exists():
-                    fix = f"A frame's folder has {RGB}, {DEPTH} and {INTRINSICS}"
-                    raise InputError(file, "", "is missing", fix)
-            return read_frame(*files, mask=more[0], pose=more[1], depth_scale_m=depth_scale_m)
+            files = frame_files(path)
+            for role in ("color", "depth", "intrinsics"):
+                if role not in files:
+                    raise _missing(path, role)
+            rgb, depth, camera = (files[role] for role in ("color", "depth", "intrinsics"))
+            more = {role: files.get(role) for role in ("mask", "pose")}
+            return read_frame(rgb, depth, camera, **more, depth_scale=depth_scale)
         case _:
-            fix = f"Name a folder with {RGB}, {DEPTH} and {INTRINSICS}, an .npz archive or a .ply cloud"
+            fix = "Name a folder with colour, depth and intrinsics, an .npz archive, or a .ply or .pcd cloud"
             raise InputError(path, "--frame", "is not a frame", fix)
+
+
+def frame_files(folder: Path) -> dict[str, Path]:
+    """Files of a frame's folder, by `color`, `depth`, `intrinsics`, `mask` and `pose`.
+
+    A folder `rgb` or `depth` with one image, as of TUM's data sets, stands for it. InputError for several.
+    """
+    names, found = _names(folder), dict[str, Path]()
+    for role, (stems, endings) in _FILES.items():
+        like = [name for name in names if _matches(name, stems, endings)]
+        if not like:
+            inside = [
+                f"{name}/{each}" for name in names if name.lower() in stems for each in _names(folder / name)
+            ]
+            like = [name for name in inside if name.lower().rpartition(".")[2] in endings]
+        usual = f"{role}.{endings[0]}"
+        exact = [name for name in like if name.partition(".")[0].lower() in stems]
+        chosen = [usual] if usual in like else exact or like
+        if len(chosen) > 1:
+            problem = f"has {len(chosen)}: {_listed(chosen)}"
+            raise InputError(folder, role, problem, f"Name the one of this frame {usual}")
+        if chosen:
+            found[role] = folder / chosen[0]
+    return found
+
+
+def _matches(name: str, stems: tuple[str, ...], endings: tuple[str, ...]) -> bool:
+    stem, _, ending = name.lower().rpartition(".")
+    bare = re.sub(r"[^a-z0-9]", "", stem)
+    # One letter is a whole name: `look.json` is no K.
+    return ending in endings and any(bare.endswith(each) if len(each) > 1 else bare == each for each in stems)
+
+
+def _names(folder: Path) -> list[str]:
+    """Sorted names of a folder, a bounded number; none of what is no folder, or cannot be read."""
+    try:
+        with os.scandir(folder) as entries:
+            return sorted(entry.name for entry in islice(entries, _MOST_LISTED))
+    except OSError:
+        return []
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + more
+
+
+def _missing(folder: Path, role: str) -> InputError:
+    (stems, endings), names = _FILES[role], _names(folder)
+    has = f"the folder has {_listed(names)}" if names else "the folder is empty"
+    fix = f"A frame's folder has {', '.join(stems)} (one of these names) as {', '.join('.' + e for e in endings)}"
+    if role != "intrinsics":
+        fix += f", or one image in {' or '.join(stem + '/' for stem in stems)}"
+    return InputError(folder, role, f"is missing: {has}", fix)
+
+
+def _scaled(image: RgbdImage, stored: npt.NDArray[np.generic], scale: float | None, place: str) -> RgbdImage:
+    """The image with depth in metres, and a note on a scale that was not given."""
+    depth_m, step_m, why = scaled_depth(stored, scale, place)
+    known = depth_m[depth_m > 0]
+    note = f"depth was read in steps of {step_m:g} m ({why}): median {np.median(known) if len(known) else 0:.2f} m"
+    notes = () if scale is not None or step_m == 1 else (note,)
+    return replace(image, depth_m=depth_m, step_m=step_m, notes=notes)
 
 
 def image_frame(image: RgbdImage, T_world_camera: F64 | None, sources: dict[str, str]) -> SensorFrame:
     """The frame of an image; `sources` names the files of rgb, depth and mask in errors."""
-    where = {name: sources.get(name, name) for name in ("rgb", "depth", "mask")}
-    for name, picture in (("rgb", image.rgb), ("mask", image.mask)):
-        if picture is not None and picture.shape[:2] != image.depth_m.shape:
-            problem = f"has {_size(picture)} pixels, but the depth image {_size(image.depth_m)}"
-            fix = "Align colour and depth, and give images of equal size"
-            raise InputError(where[name], "", problem, fix)
+    where = _refuse_sizes(image, sources)
     pixels = np.flatnonzero(image.depth_m.ravel())
     if not len(pixels):
         fix = "Check the camera's depth stream, and --depth-scale"
@@ -167,30 +254,38 @@ def image_frame(image: RgbdImage, T_world_camera: F64 | None, sources: dict[str,
     return SensorFrame(where["depth"], image.points(pixels), colours, on_target, T_world_camera, image)
 
 
-def _npz_frame(path: Path, depth_scale_m: float) -> SensorFrame:
+def _refuse_sizes(image: RgbdImage, sources: dict[str, str]) -> dict[str, str]:
+    """Names of the files of rgb, depth and mask. InputError for pictures that differ in size from the depth."""
+    where = {name: sources.get(name, name) for name in ("rgb", "depth", "mask")}
+    for name, picture in (("rgb", image.rgb), ("mask", image.mask)):
+        if picture is not None and picture.shape[:2] != image.depth_m.shape:
+            problem = f"has {_size(picture)} pixels, but the depth image {_size(image.depth_m)}"
+            fix = "Align colour and depth, and give images of equal size"
+            raise InputError(where[name], "", problem, fix)
+    return where
+
+
+def _npz_frame(path: Path, depth_scale: float | None) -> SensorFrame:
     arrays = read_arrays(path)
     for name, shape in (("depth", "(H, W)"), ("rgb", "(H, W, 3)"), ("intrinsics", "(4,)")):
         if name not in arrays:
             raise InputError(path, name, "is missing", f"Add it as an array {shape}")
-    depth, rgb, numbers = arrays["depth"], arrays["rgb"], arrays["intrinsics"]
-    if depth.ndim != 2 or depth.size > MAX_PIXELS or min(depth.shape) < 2:
-        raise InputError(path, "depth", f"has shape {depth.shape}", "Give depth as (H, W)")
-    if depth.dtype.kind != "f" and depth.dtype != np.uint16:
-        fix = "Give uint16 in steps of --depth-scale, or float in metres"
-        raise InputError(path, "depth", f"has type {depth.dtype}", fix)
+    depth, rgb, numbers = checked_depth(arrays["depth"], path), arrays["rgb"], arrays["intrinsics"]
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
         raise InputError(path, "rgb", f"is {rgb.dtype} of shape {rgb.shape}", "Give rgb as uint8 (H, W, 3)")
+    if numbers.shape == (3, 3):
+        numbers = numbers[[0, 1, 0, 1], [0, 1, 2, 2]]
     if numbers.shape != (4,) or not np.isfinite(numbers).all() or (numbers[:2] < 1).any():
-        raise InputError(path, "intrinsics", "are not fx, fy, cx, cy", "Give four numbers, in pixels")
-    scale = 1.0 if depth.dtype.kind == "f" else depth_scale_m
+        fix = "Give four numbers, in pixels, or K (3, 3)"
+        raise InputError(path, "intrinsics", "are not fx, fy, cx, cy", fix)
     mask = arrays.get("mask")
     if mask is not None and mask.ndim != 2:
         raise InputError(path, "mask", f"has shape {mask.shape}", "Give the mask as (H, W)")
     pose = arrays.get("T_world_camera")
-    with np.errstate(over="ignore", invalid="ignore"):
-        metres = valid_depth((depth.astype(np.float64) * scale).astype(np.float32))
     fx, fy, cx, cy = (float(n) for n in numbers)
-    image = RgbdImage(rgb, metres, Pinhole(fx, fy, cx, cy), None if mask is None else mask.astype(np.bool_))
+    marked = None if mask is None else mask.astype(np.bool_)
+    blank = RgbdImage(rgb, np.empty(0, np.float32), Pinhole(fx, fy, cx, cy), marked)
+    image = _scaled(blank, depth, depth_scale, str(path))
     T = None if pose is None else checked_pose(pose.astype(np.float64), str(path))
     return image_frame(image, T, {name: f"{path}: {name}" for name in ("rgb", "depth", "mask")})
 

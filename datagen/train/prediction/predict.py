@@ -226,7 +226,8 @@ def predict(
     allowed = (CLEAR, UNSEEN) if allow_unseen else (CLEAR,)
     seen_from_goal = None if arrival is None else arrival.turned(robot.yaw_rad)
     choice = choose(score, cells, allowed, scorer.threshold, seen_from_goal)
-    notes = (*_notes(grounds, filled, cloud), *robot_notes(scorer, robot))
+    read = (note for frame in frames if frame.image is not None for note in frame.image.notes)
+    notes = (*read, *_notes(grounds, filled, cloud), *robot_notes(scorer, robot))
     given = (scorer.name, robot, tuple(frames), tuple(grounds))
     return Prediction(*given, seen, target, filled, cloud, cells, score, choice, arrival, notes)
 
