@@ -4,8 +4,8 @@
 
 Scenes of the test houses as runs draw them, each frame once exact and once with the stereo noise of
 `workers/rendering/noise.py`, depth in whole millimetres. Centre: error of the estimate from the true mask.
-Click: overlap (intersection over union) of the region grown from the target's middle pixel and the true mask, 0
-for a click that is refused.
+Click: overlap (intersection over union) of the region grown from the target's middle pixel and the true mask,
+0 for a click that is refused.
 Floor: tilt, and the error in the target's height, where it is found from the image and the camera's height;
 wrong where these are above 3 degrees or 40 mm, doubted where the answer says that the floor is uncertain.
 """
@@ -122,7 +122,7 @@ def _overlap(scene: Scene, frame: SensorFrame) -> float:
 
 
 def _floor(scene: Scene, frame: SensorFrame) -> tuple[F64 | None, bool]:
-    """(tilt in degrees, error of the target's height in mm, 1 if doubted) or None; whether a floor is in sight."""
+    """(tilt in degrees, error of the target's height in mm, doubted) or None; whether a floor is in sight."""
     true = scene.camera.T_world_camera
     world = frame.points_m @ true[:3, :3].T + true[:3, 3]
     has_floor = bool(floor_points(world, true[:3, 3]).mean() > 0.03)

@@ -79,33 +79,27 @@ def checked_depth(depth: Array, path: Path) -> Array:
     return depth
 
 
-def scaled_depth(depth: Array, scale: float | None, place: str) -> tuple[F32, float, str]:
-    """(depth (H, W) in metres, 0 where nothing was measured; metres a step; where the scale comes from).
+def scaled_depth(depth: Array, scale: float | None, place: str | Path) -> tuple[F32, float, tuple[str, ...]]:
+    """(depth (H, W) in metres, 0 where nothing was measured; metres a step; notes).
 
     `scale` is in metres a step below 1, else in steps a metre. Without it whole numbers are millimetres, and
     floats metres, or millimetres where their median is above 50. InputError for a median that no camera of
     rooms has: it names the scales that give one.
     """
     known = depth[np.isfinite(depth) & (depth > 0)].astype(np.float64)
-    median = float(np.median(known)) if len(known) else 0.0
-    whole = depth.dtype.kind != "f"
-    step_m = (0.001 if whole or median > 50 else 1.0) if scale is None else scale if scale < 1 else 1 / scale
-    why = (
-        f"--depth-scale {scale:g}"
-        if scale is not None
-        else "16-bit numbers"
-        if whole
-        else f"median {median:.4g}"
-    )
-    if len(known) and not _MEDIAN_M[0] <= median * step_m <= _MEDIAN_M[1]:
+    median, whole = float(np.median(known)) if len(known) else 0.0, depth.dtype.kind != "f"
+    step_m = (0.001 if whole or median > 50 else 1.0) if scale is None else min(scale, 1 / scale)
+    why = "16-bit numbers" if whole else f"floats with a median of {median:.4g}"
+    why, metres = why if scale is None else f"--depth-scale {scale:g}", median * step_m
+    if len(known) and not _MEDIAN_M[0] <= metres <= _MEDIAN_M[1]:
         likely = [f"{n} (median {median / n:.2f} m)" for n in STEPS if 0.3 <= median / n <= 6]
         fix = f"Give --depth-scale {' or '.join(likely)}" if likely else "Check the camera's depth stream"
-        problem = (
-            f"has a median of {median:.4g} steps, {median * step_m:.4g} m at {step_m:g} m a step ({why})"
-        )
+        problem = f"has a median of {metres:.4g} m at {step_m:g} m a step ({why})"
         raise InputError(place, "depth", problem, fix)
+    note = f"depth was read in steps of {step_m:g} m ({why}): median {metres:.2f} m"
     with np.errstate(over="ignore", invalid="ignore"):
-        return valid_depth((depth.astype(np.float64) * step_m).astype(np.float32)), step_m, why
+        depth_m = valid_depth((depth.astype(np.float64) * step_m).astype(np.float32))
+    return depth_m, step_m, () if scale is not None or step_m == 1 else (note,)
 
 
 def valid_depth(depth_m: F32) -> F32:

@@ -28,14 +28,12 @@ from datagen.train.prediction.intrinsics import Pinhole, read_intrinsics
 from datagen.train.prediction.pcd import read_pcd
 from datagen.train.prediction.ply import read_ply
 
-# Of each file of a frame's folder: ends of its name before the dot, and the endings; the first is the usual one.
+# Of each file of a frame's folder: its name, or the end of it, before the dot, and its endings.
+_CAMERA = ("intrinsics", "intrinsic", "camerainfo", "camera", "calibration", "calib", "k")
 _FILES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "color": (("color", "colour", "rgb", "image"), ("png", "jpg", "jpeg", "tif", "tiff", "ppm")),
     "depth": (("depth",), ("png", "tif", "tiff", "pgm", "npy", "npz")),
-    "intrinsics": (
-        ("intrinsics", "intrinsic", "camerainfo", "camera", "calibration", "calib", "k"),
-        ("json", "yaml", "yml", "txt"),
-    ),
+    "intrinsics": (_CAMERA, ("json", "yaml", "yml", "txt")),
     "mask": (("mask",), ("png",)),
     "pose": (("pose",), ("json",)),
 }
@@ -52,7 +50,7 @@ class RgbdImage:
     mask: Bools | None  # (H, W), the target's pixels
     # Where it was undistorted: flat index (H, W) of each pixel in the picture that was given, -1 for none.
     source: I64 | None = None
-    step_m: float | None = None  # of depth that is stored as whole numbers
+    step_m: float = 0.0  # metres a step of the stored depth; 0 where it is not from a file
     notes: tuple[str, ...] = ()  # on how the files were read, for the answer
 
     def points(self, pixels: I64, depth_m: F32 | None = None) -> F32:
@@ -129,31 +127,30 @@ def read_frame(
     pose: str | Path | None = None,
     depth_scale: float | None = None,
 ) -> SensorFrame:
-    """A frame of two aligned images and a file of intrinsics, undistorted. InputError for bad or unequal files.
+    """An undistorted frame of two aligned images and intrinsics. InputError for bad or unequal files.
 
     `depth_scale` is in metres a step below 1, else in steps a metre; None chooses it by the depth image.
     """
     colour, stored = read_rgb(Path(rgb)), read_depth(Path(depth))
-    camera = read_intrinsics(Path(intrinsics))
+    camera, (height, width) = read_intrinsics(Path(intrinsics)), stored.shape
     chosen = None if mask is None else read_mask(Path(mask))
-    height, width = stored.shape
-    if camera.size_px not in (None, (width, height)):
+    if camera.size_px is not None and camera.size_px != (width, height):
         problem = f"is {camera.size_px[0]}x{camera.size_px[1]}, but the depth image has {_size(stored)}"
         raise InputError(intrinsics, "width, height", problem, "Give the intrinsics of this stream")
     T = None if pose is None else read_pose(Path(pose))
-    image = _scaled(
-        RgbdImage(colour, np.empty(0, np.float32), camera.pinhole, chosen), stored, depth_scale, str(depth)
-    )
+    depth_m, step_m, notes = scaled_depth(stored, depth_scale, depth)
+    image = RgbdImage(colour, depth_m, camera.pinhole, chosen, step_m=step_m, notes=notes)
     sources = {"rgb": str(rgb), "depth": str(depth), "mask": str(mask)}
-    _refuse_sizes(image, sources)
-    if (source := camera.source_pixels(height, width)) is not None:
-        note = f"lens distortion ({camera.model or 'Brown-Conrady'}) was undone"
-        image = replace(image.undistorted(source), notes=(*image.notes, note))
+    frame = image_frame(image, T, sources)
+    if (source := camera.source_pixels(height, width)) is None:
+        return frame
+    note = f"lens distortion ({camera.model or 'Brown-Conrady'}) was undone"
+    image = replace(image.undistorted(source), notes=(*image.notes, note))
     return image_frame(image, T, sources)
 
 
 def read_place(place: str | Path, depth_scale: float | None = None) -> SensorFrame:
-    """The frame of a folder, of an .npz archive or of a .ply or .pcd cloud; `depth_scale` as for `read_frame`.
+    """The frame of a folder, an .npz archive or a .ply or .pcd cloud; `depth_scale` as for `read_frame`.
 
     A folder holds a colour and a depth image, intrinsics, and optionally a mask and a pose, by usual names.
     """
@@ -168,10 +165,13 @@ def read_place(place: str | Path, depth_scale: float | None = None) -> SensorFra
             files = frame_files(path)
             for role in ("color", "depth", "intrinsics"):
                 if role not in files:
-                    raise _missing(path, role)
-            rgb, depth, camera = (files[role] for role in ("color", "depth", "intrinsics"))
+                    (stems, endings), has = _FILES[role], _listed(_names(path)) or "no files"
+                    fix = f"A frame's folder has {', '.join(stems)} as .{', .'.join(endings)}"
+                    fix += "" if role == "intrinsics" else f", or one image in {' or '.join(stems)}/"
+                    raise InputError(path, role, f"is missing: the folder has {has}", fix)
             more = {role: files.get(role) for role in ("mask", "pose")}
-            return read_frame(rgb, depth, camera, **more, depth_scale=depth_scale)
+            three = (files[role] for role in ("color", "depth", "intrinsics"))
+            return read_frame(*three, **more, depth_scale=depth_scale)
         case _:
             fix = "Name a folder with colour, depth and intrinsics, an .npz archive, or a .ply or .pcd cloud"
             raise InputError(path, "--frame", "is not a frame", fix)
@@ -186,10 +186,8 @@ def frame_files(folder: Path) -> dict[str, Path]:
     for role, (stems, endings) in _FILES.items():
         like = [name for name in names if _matches(name, stems, endings)]
         if not like:
-            inside = [
-                f"{name}/{each}" for name in names if name.lower() in stems for each in _names(folder / name)
-            ]
-            like = [name for name in inside if name.lower().rpartition(".")[2] in endings]
+            inside = [f"{name}/{each}" for name in names if name in stems for each in _names(folder / name)]
+            like = [name for name in inside if name.lower().endswith(endings)]
         usual = f"{role}.{endings[0]}"
         exact = [name for name in like if name.partition(".")[0].lower() in stems]
         chosen = [usual] if usual in like else exact or like
@@ -204,8 +202,11 @@ def frame_files(folder: Path) -> dict[str, Path]:
 def _matches(name: str, stems: tuple[str, ...], endings: tuple[str, ...]) -> bool:
     stem, _, ending = name.lower().rpartition(".")
     bare = re.sub(r"[^a-z0-9]", "", stem)
+    bare = bare.removesuffix("image") or bare
     # One letter is a whole name: `look.json` is no K.
-    return ending in endings and any(bare.endswith(each) if len(each) > 1 else bare == each for each in stems)
+    return ending in endings and (
+        bare in stems or bare.endswith(tuple(each for each in stems if each != "k"))
+    )
 
 
 def _names(folder: Path) -> list[str]:
@@ -222,27 +223,14 @@ def _listed(names: list[str]) -> str:
     return ", ".join(names[:_LISTED]) + more
 
 
-def _missing(folder: Path, role: str) -> InputError:
-    (stems, endings), names = _FILES[role], _names(folder)
-    has = f"the folder has {_listed(names)}" if names else "the folder is empty"
-    fix = f"A frame's folder has {', '.join(stems)} (one of these names) as {', '.join('.' + e for e in endings)}"
-    if role != "intrinsics":
-        fix += f", or one image in {' or '.join(stem + '/' for stem in stems)}"
-    return InputError(folder, role, f"is missing: {has}", fix)
-
-
-def _scaled(image: RgbdImage, stored: npt.NDArray[np.generic], scale: float | None, place: str) -> RgbdImage:
-    """The image with depth in metres, and a note on a scale that was not given."""
-    depth_m, step_m, why = scaled_depth(stored, scale, place)
-    known = depth_m[depth_m > 0]
-    note = f"depth was read in steps of {step_m:g} m ({why}): median {np.median(known) if len(known) else 0:.2f} m"
-    notes = () if scale is not None or step_m == 1 else (note,)
-    return replace(image, depth_m=depth_m, step_m=step_m, notes=notes)
-
-
 def image_frame(image: RgbdImage, T_world_camera: F64 | None, sources: dict[str, str]) -> SensorFrame:
     """The frame of an image; `sources` names the files of rgb, depth and mask in errors."""
-    where = _refuse_sizes(image, sources)
+    where = {name: sources.get(name, name) for name in ("rgb", "depth", "mask")}
+    for name, picture in (("rgb", image.rgb), ("mask", image.mask)):
+        if picture is not None and picture.shape[:2] != image.depth_m.shape:
+            problem = f"has {_size(picture)} pixels, but the depth image {_size(image.depth_m)}"
+            fix = "Align colour and depth, and give images of equal size"
+            raise InputError(where[name], "", problem, fix)
     pixels = np.flatnonzero(image.depth_m.ravel())
     if not len(pixels):
         fix = "Check the camera's depth stream, and --depth-scale"
@@ -252,17 +240,6 @@ def image_frame(image: RgbdImage, T_world_camera: F64 | None, sources: dict[str,
     on_target = None if image.mask is None else image.mask.ravel()[pixels]
     colours = image.rgb.reshape(-1, 3)[pixels]
     return SensorFrame(where["depth"], image.points(pixels), colours, on_target, T_world_camera, image)
-
-
-def _refuse_sizes(image: RgbdImage, sources: dict[str, str]) -> dict[str, str]:
-    """Names of the files of rgb, depth and mask. InputError for pictures that differ in size from the depth."""
-    where = {name: sources.get(name, name) for name in ("rgb", "depth", "mask")}
-    for name, picture in (("rgb", image.rgb), ("mask", image.mask)):
-        if picture is not None and picture.shape[:2] != image.depth_m.shape:
-            problem = f"has {_size(picture)} pixels, but the depth image {_size(image.depth_m)}"
-            fix = "Align colour and depth, and give images of equal size"
-            raise InputError(where[name], "", problem, fix)
-    return where
 
 
 def _npz_frame(path: Path, depth_scale: float | None) -> SensorFrame:
@@ -282,10 +259,9 @@ def _npz_frame(path: Path, depth_scale: float | None) -> SensorFrame:
     if mask is not None and mask.ndim != 2:
         raise InputError(path, "mask", f"has shape {mask.shape}", "Give the mask as (H, W)")
     pose = arrays.get("T_world_camera")
-    fx, fy, cx, cy = (float(n) for n in numbers)
-    marked = None if mask is None else mask.astype(np.bool_)
-    blank = RgbdImage(rgb, np.empty(0, np.float32), Pinhole(fx, fy, cx, cy), marked)
-    image = _scaled(blank, depth, depth_scale, str(path))
+    pinhole, marked = Pinhole(*numbers.tolist()), None if mask is None else mask.astype(np.bool_)
+    depth_m, step_m, notes = scaled_depth(depth, depth_scale, path)
+    image = RgbdImage(rgb, depth_m, pinhole, marked, step_m=step_m, notes=notes)
     T = None if pose is None else checked_pose(pose.astype(np.float64), str(path))
     return image_frame(image, T, {name: f"{path}: {name}" for name in ("rgb", "depth", "mask")})
 

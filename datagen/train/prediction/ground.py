@@ -77,11 +77,11 @@ def find_ground(frame: SensorFrame, camera_height_m: float | None, gravity: F64 
     """
     if frame.T_world_camera is not None:
         T = frame.T_world_camera
+        _refuse_pose(frame, T)
         if camera_height_m is not None and abs(T[2, 3] - camera_height_m) > _tolerance_m(camera_height_m):
             problem = f"is {T[2, 3]:.2f} m in the pose, but --camera-height is {camera_height_m:.2f} m"
             fix = "Correct one of them; the floor of the pose's world is at z = 0"
             raise InputError(frame.place, "camera height", problem, fix)
-        _refuse_pose(frame, T)
         return _with_residual(frame, T, "the pose given with the frame")
     if camera_height_m is None:
         fix = "Give --camera-height in metres above the floor, or the camera's pose"
@@ -187,7 +187,7 @@ def _sample(frame: SensorFrame) -> tuple[F64, F64]:
 
 @dataclass(frozen=True, eq=False)
 class _Floor:
-    """A floor: up (3,) in the camera's frame, the camera's height, its share of all points, why it is doubted."""
+    """A floor: up (3,) in the camera's frame, its share of all points, and why it is doubted."""
 
     up: F64
     height_m: float
@@ -198,8 +198,8 @@ class _Floor:
 def _floor_plane(frame: SensorFrame, camera_height_m: float) -> _Floor:
     """The floor seen in the frame; of a rolled camera where an upright one does not see any.
 
-    The floor of a rolled camera and a wall beside an upright one look alike: where both fit, or the rolled one
-    alone, the floor is doubted.
+    The floor of a rolled camera and a wall beside an upright one look alike: where both fit, or the rolled
+    one alone, the floor is doubted.
     """
     points, normals = _sample(frame)
     found = [_floor_towards(frame, points, normals, np.array(side[:2]), camera_height_m) for side in _SIDES]
@@ -248,8 +248,8 @@ def _floor_towards(
         x, y, z = np.round(-up, 3)
         hint = f"level surfaces suggest {x:g},{y:g},{z:g}"
         fix = f"Correct --camera-height, or, if that surface is not the floor: {_FIX}; {hint}"
-        step_m = None if frame.image is None else frame.image.step_m
-        for steps in STEPS if step_m is not None else ():
+        step_m = 0.0 if frame.image is None else frame.image.step_m
+        for steps in STEPS if step_m else ():
             scaled_m = np.array(below_m) / (steps * step_m)
             if np.abs(scaled_m - camera_height_m).min() < _SURE_OFF_M:
                 fix = f"Give --depth-scale {steps}, with which one is there, or: {fix}"
@@ -284,7 +284,7 @@ def _normals(frame: SensorFrame, rows: I64) -> F64:
 
 
 def _way_up(normals: F64, side: F64) -> F64 | None:
-    """The direction (3,) of most normals (N, 3) that point to a side (2,) of the picture; None where none does."""
+    """The direction (3,) of most normals (N, 3) that point to a side (2,) of the picture, or None."""
     across = np.array([side[1], -side[0]])
     turned = np.abs(normals[:, :2] @ across) < _MOST_ROLL
     upward = normals[(normals[:, :2] @ side > _LEAST_UP) & turned]

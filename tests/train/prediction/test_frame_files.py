@@ -52,6 +52,7 @@ def frame(folder: Path, color: str = "color.png", depth: str = "depth.png", came
         ("image.ppm", "depth.npy", "camera.json"),
         ("rgb/1305031.png", "depth/1305032.png", "camera_intrinsic.txt"),
         ("000012.color.jpg", "000012.depth.pgm", "k.txt"),
+        ("color_image.png", "depth_image.png", "rgb_camera_info.yaml"),
         ("RGB.PNG", "head_depth.npz", "camera-info.yml"),
     ],
 )
@@ -79,7 +80,7 @@ def test_the_usual_name_comes_first_and_several_others_are_refused(tmp_path: Pat
 @pytest.mark.parametrize(
     ("gone", "words"),
     [
-        ("color.png", r"color: is missing: the folder has K\.txt, depth\.png\. .*rgb.*\.jpg.*rgb/"),
+        ("color.png", r"color: is missing: the folder has K\.txt, depth\.png\. .*rgb, image.*\.jpg.*rgb"),
         ("depth.png", r"depth: is missing: the folder has K\.txt, color\.png\. .*depth.*\.tiff.*depth/"),
         ("K.txt", r"intrinsics: is missing: the folder has color\.png, depth\.png\. .*camerainfo.*\.yaml"),
     ],
@@ -140,7 +141,7 @@ def test_depth_is_scaled_as_given_or_by_its_median(
         (METRES * 1000, 1, r"1216 m at 1 m a step.*--depth-scale 1000 \(median 1.22 m\)"),
         (STEPS * 16, None, r"19.45 m at 0.001 m a step \(16-bit numbers\).*5000 \(.*10000 \(median 1.94 m\)"),
         (STEPS, 1e-6, r"--depth-scale 1e-06.*Give --depth-scale 1000"),
-        (METRES, 0.001, r"0.001216 m.*Give --depth-scale 1 \(median 1.22 m\)"),
+        (METRES, 0.001, r"0.001215 m.*Give --depth-scale 1 \(median 1.22 m\)"),
         (METRES * 1e-30, None, r"Check the camera's depth stream"),
         (STEPS * 0, None, "no pixel has depth"),
         (np.full((24, 32), np.nan), None, "no pixel has depth"),

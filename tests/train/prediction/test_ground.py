@@ -50,7 +50,7 @@ def turned(frame: SensorFrame, quarters: int) -> SensorFrame:
     for k in range(quarters):
         p = Pinhole(p.fy_px, p.fx_px, p.cy_px, width - 1 - p.cx_px)
         width = image.depth_m.shape[k % 2]
-    rgb, depth_m = (np.rot90(each, quarters).copy() for each in (image.rgb, image.depth_m))
+    rgb, depth_m = np.rot90(image.rgb, quarters).copy(), np.rot90(image.depth_m, quarters).copy()
     mask = None if image.mask is None else np.rot90(image.mask, quarters).copy()
     return image_frame(RgbdImage(rgb, depth_m, p, mask), None, {})
 
@@ -84,7 +84,7 @@ def test_rolled_cameras_have_the_answer_of_the_upright_one(real: tuple[SensorFra
             assert np.linalg.norm(other.center_m - upright.center_m) < 0.02
             assert np.abs(other.base_xy_m - upright.base_xy_m).max() < 0.02
             assert (other.cells.state == upright.cells.state).mean() > 0.95
-            assert np.abs(other.score - upright.score).mean() < 1.5 * max(sampled)
+            assert np.abs(other.score - upright.score).mean() < 2 * max(sampled)
         with pytest.raises(InputError, match="points up, by the level surfaces"):
             find_ground(rolled, height_m, -down)
 

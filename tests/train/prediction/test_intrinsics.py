@@ -1,8 +1,9 @@
-"""Intrinsics by content, in the files that robots have; distortion is undone, and unknown lenses are refused."""
+"""Intrinsics by content, in the files that robots have; distortion is undone, unknown lenses are refused."""
 
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from PIL import Image
 
 from datagen.schemas.errors import InputError
 from datagen.train.prediction.frames import SensorFrame, read_frame
-from datagen.train.prediction.intrinsics import Pinhole, read_intrinsics
+from datagen.train.prediction.intrinsics import Intrinsics, Pinhole, read_intrinsics
 from datagen.workers.geometry.mesh import F64
 
 PINHOLE = Pinhole(615.5, 616.25, 321.5, 238.75)
@@ -87,9 +88,9 @@ KNOWN: dict[str, tuple[str, list[float], bool]] = {
     "Open3D": (json.dumps({**SIZE, "intrinsic_matrix": np.array(ROWS).T.ravel().tolist()}), [], True),
     "K and D": (json.dumps({"K": ROWS, "D": D}), D, False),
     "rows alone": (json.dumps(ROWS), [], False),
-    "RealSense": (json.dumps({**SIZE, **PPX, "model": "distortion.inverse_brown_conrady", "coeffs": D}), D, True),
+    "RealSense": (json.dumps({**SIZE, **PPX, "model": "distortion.brown_conrady", "coeffs": D}), D, True),
     "in an object": (json.dumps({"color": {**SIZE, **PPX, "coeffs": D}, "serial": "1"}), D, True),
-    "Azure Kinect": (json.dumps({**PPX, "k1": 0.1, "k2": -0.2, "p1": 0.001, "p2": -0.002, "k3": 0.05}), D, False),
+    "Azure Kinect": (json.dumps(PPX | dict(zip(("k1", "k2", "p1", "p2", "k3"), D, strict=True))), D, False),
 }  # fmt: skip
 
 
@@ -114,8 +115,8 @@ def test_the_files_of_robots_are_read_by_content(name: str, tmp_path: Path) -> N
         ("a:\n" * 20_000, "no camera"),
         ("1 " * 1000, "1000 entries"),
         ("k:\n" + "- 1\n" * 15_000, "15000 entries"),
-        ("1 0 2 0 1 2 5 5 1", "not a camera's matrix"),
-        ("500 3 320 0 500 240 0 0 1", "not a camera's matrix"),
+        ("1 0 2 0 1 2 5 5 1", "no matrix fx 0 cx"),
+        ("500 3 320 0 500 240 0 0 1", "no matrix fx 0 cx"),
         ("nan 0 320 0 500 240 0 0 1", "nan is not within"),
         ('{"K": [[1, {}]]}', "not a number"),
         (json.dumps({"a": PPX, "b": PPX}), "2 cameras"),
@@ -153,7 +154,7 @@ LENSES: dict[str, tuple[object, list[float]]] = {
     "plumb_bob": (brown, [-0.25, 0.09, 0.002, -0.003, -0.01]),
     "Brown Conrady": (brown, [0.3, -0.1, 0.001, 0.002, 0.02]),
     "rational_polynomial": (brown, [0.3, 0.02, 0.001, 0.0005, 0.005, 0.5, 0.05, 0.003]),
-    "Inverse Brown Conrady": (lambda x, y, k: brown(x, y, k, shift_scaled=True), [-0.1, 0.02, 0.02, -0.02, -0.001]),
+    "Inverse Brown Conrady": (partial(brown, shift_scaled=True), [-0.1, 0.02, 0.02, -0.02, -0.001]),
     "equidistant": (fisheye, [-0.02, 0.01, -0.004, 0.001]),
     "Kannala Brandt4": (fisheye, [0.0, 0.0, 0.0, 0.0]),
 }  # fmt: skip
@@ -173,7 +174,7 @@ def shown(lens: str) -> tuple[F64, F64]:
     np.testing.assert_allclose(np.stack(model(*rays.transpose(2, 0, 1), k), axis=2), seen, atol=1e-6)  # type: ignore[operator]
     depth = OFF_M / (np.concatenate([rays, np.ones((H, W, 1))], axis=2) @ NORMAL)
     box = (np.abs(rays - [0.25, 0.2]) < 0.15).all(axis=2)
-    return np.where(box, BOX_M, depth), rays
+    return np.where(box, BOX_M, depth).astype(np.float64), rays.astype(np.float64)
 
 
 def read(folder: Path, lens: str, depth: F64, model: str | None = None) -> SensorFrame:
@@ -208,6 +209,16 @@ def test_distortion_is_undone_to_half_a_pixel_and_keeps_edges(lens: str, tmp_pat
     assert np.abs(raw @ NORMAL - OFF_M).max() > 2 * off_m.max()
 
 
+def test_what_a_polynomial_folds_over_or_mirrors_is_left_out() -> None:
+    camera = Intrinsics("file", Pinhole(100.0, 100.0, 200.0, 150.0), None, "plumb_bob", (-0.15,))
+    source = camera.source_pixels(301, 401)
+    assert source is not None
+    v, u = np.indices(source.shape)
+    r = np.hypot(u - 200, v - 150) / 100
+    # The radius grows up to r = 1 / sqrt(0.45), and is 0 again at 1 / sqrt(0.15).
+    assert (source[r < 1.47] >= 0).all() and (source[r > 1.52] < 0).all()
+
+
 def test_a_click_is_a_pixel_of_the_picture_that_was_given(tmp_path: Path) -> None:
     depth, _ = shown("plumb_bob")
     image = read(tmp_path, "plumb_bob", depth).image
@@ -223,8 +234,8 @@ def test_a_click_is_a_pixel_of_the_picture_that_was_given(tmp_path: Path) -> Non
     [
         ("FTheta", [0.5], "FTheta is unknown"),
         ("double_sphere", [0.5, 0.1], "double_sphere is unknown"),
-        ("equidistant", [0.1, 0, 0, 0, 0.2], "more than 4"),
-        ("plumb_bob", [0.1] * 13, "more than 12"),
+        ("equidistant", [0.1, 0, 0, 0, 0.2], "has 5 coefficients"),
+        ("plumb_bob", [0.1] * 13, "has 13 coefficients"),
         ("plumb_bob", [-5000, 0, 0, 0, 0], "of the picture"),
         ("rational_polynomial", [1e6] * 8, "of the picture"),
     ],
