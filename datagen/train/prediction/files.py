@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import re
+import struct
 import warnings
 import zipfile
 from pathlib import Path
@@ -30,6 +31,11 @@ _EXTENT_M = 1000.0
 MAX_DEPTH_M = 20.0
 # Medians of depth images of rooms (m), and steps a metre that cameras and data sets have.
 _MEDIAN_M, STEPS = (0.05, 15.0), (1, 1000, 4000, 5000, 10_000)
+# What readers of Pillow raise, above all those of TIFF.
+_DAMAGED_IMAGE = (
+    OSError, ValueError, SyntaxError, EOFError, TypeError, AttributeError, LookupError, ArithmeticError,
+    RuntimeError, struct.error,
+)  # fmt: skip
 NAMES = ("rgb", "depth", "intrinsics", "mask", "T_world_camera")
 _MAX_ARRAY_BYTES = 4 * MAX_PIXELS
 _MAX_RECORDS = 10_000
@@ -64,8 +70,10 @@ def read_depth(path: Path) -> Array:
     values = np.asarray(image)
     if data[:2] in (b"P2", b"P5") and image.mode == "I":
         # Pillow scales the values of a PGM from its largest one to 16 bits.
-        largest = re.sub(rb"#[^\n]*", b"", data[:1000]).split()[3]
-        values = np.rint(values * (int(largest) / 65535))
+        words = re.sub(rb"#[^\n]*", b"", data[:10_000]).split(maxsplit=4)
+        if len(words) < 4:
+            raise InputError(path, "", "has a header of more than 10,000 bytes", "Leave out its comments")
+        values = np.rint(values * (int(words[3]) / 65535))
     return checked_depth(values if image.mode == "F" else np.clip(values, 0, 65535).astype(np.uint16), path)
 
 
@@ -191,8 +199,8 @@ def _opened(path: Path, formats: tuple[str, ...], mode: str | None) -> Image.Ima
     data = io.BytesIO(read_regular(path, MAX_FILE_BYTES, FILE_FIX))
     try:
         with warnings.catch_warnings():
-            # Our own limit, checked below, is stricter than the one that warns.
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            # Our own limit of size is stricter than the one that warns; other warnings are of damaged tags.
+            warnings.simplefilter("ignore")
             with Image.open(data, formats=formats) as image:
                 _refuse_size(path, *image.size)
                 image.load()
@@ -202,7 +210,7 @@ def _opened(path: Path, formats: tuple[str, ...], mode: str | None) -> Image.Ima
         raise
     except InputError:
         raise
-    except (OSError, ValueError, SyntaxError, EOFError) as error:
+    except _DAMAGED_IMAGE as error:
         problem = f"is not a readable {kinds} image ({type(error).__name__})"
         raise InputError(path, "", problem, f"Save it again as {kinds}") from None
 

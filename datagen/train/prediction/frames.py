@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
 
@@ -28,11 +29,11 @@ from datagen.train.prediction.intrinsics import Pinhole, read_intrinsics
 from datagen.train.prediction.pcd import read_pcd
 from datagen.train.prediction.ply import read_ply
 
-# Of each file of a frame's folder: its name, or the end of it, before the dot, and its endings.
-_CAMERA = ("intrinsics", "intrinsic", "camerainfo", "camera", "calibration", "calib", "k")
+# Of each file of a frame's folder: its names before the dot, and its endings. The first are the usual ones.
+_CAMERA = ("*intrinsics", "*intrinsic", "*camerainfo", "camera", "calibration", "calib", "k")
 _FILES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "color": (("color", "colour", "rgb", "image"), ("png", "jpg", "jpeg", "tif", "tiff", "ppm")),
-    "depth": (("depth",), ("png", "tif", "tiff", "pgm", "npy", "npz")),
+    "color": (("*color", "*colour", "*rgb", "image"), ("png", "jpg", "jpeg", "tif", "tiff", "ppm")),
+    "depth": (("*depth",), ("png", "tif", "tiff", "pgm", "npy", "npz")),
     "intrinsics": (_CAMERA, ("json", "yaml", "yml", "txt")),
     "mask": (("mask",), ("png",)),
     "pose": (("pose",), ("json",)),
@@ -165,9 +166,9 @@ def read_place(place: str | Path, depth_scale: float | None = None) -> SensorFra
             files = frame_files(path)
             for role in ("color", "depth", "intrinsics"):
                 if role not in files:
-                    (stems, endings), has = _FILES[role], _listed(_names(path)) or "no files"
-                    fix = f"A frame's folder has {', '.join(stems)} as .{', .'.join(endings)}"
-                    fix += "" if role == "intrinsics" else f", or one image in {' or '.join(stems)}/"
+                    (patterns, endings), has = _FILES[role], _listed(_names(path)) or "no files"
+                    fix = f"A frame's folder has {', '.join(patterns)} as .{', .'.join(endings)}"
+                    fix += "" if role == "intrinsics" else f", or one image in {patterns[0][1:]}/"
                     raise InputError(path, role, f"is missing: the folder has {has}", fix)
             more = {role: files.get(role) for role in ("mask", "pose")}
             three = (files[role] for role in ("color", "depth", "intrinsics"))
@@ -183,12 +184,12 @@ def frame_files(folder: Path) -> dict[str, Path]:
     A folder `rgb` or `depth` with one image, as of TUM's data sets, stands for it. InputError for several.
     """
     names, found = _names(folder), dict[str, Path]()
-    for role, (stems, endings) in _FILES.items():
-        like = [name for name in names if _matches(name, stems, endings)]
+    for role, (patterns, endings) in _FILES.items():
+        stems, usual = [pattern.removeprefix("*") for pattern in patterns], f"{role}.{endings[0]}"
+        like = [name for name in names if _matches(name, patterns, endings)]
         if not like:
             inside = [f"{name}/{each}" for name in names if name in stems for each in _names(folder / name)]
             like = [name for name in inside if name.lower().endswith(endings)]
-        usual = f"{role}.{endings[0]}"
         exact = [name for name in like if name.partition(".")[0].lower() in stems]
         chosen = [usual] if usual in like else exact or like
         if len(chosen) > 1:
@@ -199,14 +200,11 @@ def frame_files(folder: Path) -> dict[str, Path]:
     return found
 
 
-def _matches(name: str, stems: tuple[str, ...], endings: tuple[str, ...]) -> bool:
+def _matches(name: str, patterns: tuple[str, ...], endings: tuple[str, ...]) -> bool:
     stem, _, ending = name.lower().rpartition(".")
     bare = re.sub(r"[^a-z0-9]", "", stem)
     bare = bare.removesuffix("image") or bare
-    # One letter is a whole name: `look.json` is no K.
-    return ending in endings and (
-        bare in stems or bare.endswith(tuple(each for each in stems if each != "k"))
-    )
+    return ending in endings and any(fnmatchcase(bare, pattern) for pattern in patterns)
 
 
 def _names(folder: Path) -> list[str]:
@@ -259,7 +257,7 @@ def _npz_frame(path: Path, depth_scale: float | None) -> SensorFrame:
     if mask is not None and mask.ndim != 2:
         raise InputError(path, "mask", f"has shape {mask.shape}", "Give the mask as (H, W)")
     pose = arrays.get("T_world_camera")
-    pinhole, marked = Pinhole(*numbers.tolist()), None if mask is None else mask.astype(np.bool_)
+    pinhole, marked = Pinhole(*map(float, numbers)), None if mask is None else mask.astype(np.bool_)
     depth_m, step_m, notes = scaled_depth(depth, depth_scale, path)
     image = RgbdImage(rgb, depth_m, pinhole, marked, step_m=step_m, notes=notes)
     T = None if pose is None else checked_pose(pose.astype(np.float64), str(path))

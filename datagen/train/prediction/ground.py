@@ -209,16 +209,15 @@ def _floor_plane(frame: SensorFrame, camera_height_m: float) -> _Floor:
         if isinstance(floor, _Floor) and floor.doubt is None
     ]
     upright = found[0]
-    if not rolled:
+    if rolled:
+        floor, roll = max(rolled, key=lambda each: each[0].share)
         if isinstance(upright, InputError):
-            raise upright
-        return upright
-    floor, roll = max(rolled, key=lambda each: each[0].share)
-    if isinstance(upright, _Floor):
-        return replace(
-            upright, doubt=upright.doubt or f"another surface fits if the camera is rolled by {roll}"
-        )
-    return replace(floor, doubt=f"it fits if the camera is rolled by {roll}")
+            return replace(floor, doubt=f"it fits if the camera is rolled by {roll}")
+        doubt = upright.doubt or f"another surface fits if the camera is rolled by {roll}"
+        return replace(upright, doubt=doubt)
+    if isinstance(upright, InputError):
+        raise upright
+    return upright
 
 
 def _floor_towards(

@@ -36,31 +36,26 @@ def read_pcd(path: Path) -> PointFile:
         raise InputError(path, "header", "has FIELDS, SIZE, TYPE and COUNT that do not agree", _FIX)
     if form not in ("ascii", "binary"):
         raise InputError(path, "DATA", f"is {form[:40]}", _FIX)
-    fields = [
-        (f"{name}{k}" if k or name == "_" else name, kind)
-        for name, kind, count in zip(names, kinds, counts, strict=True)
-        for k in range(int(count))
-    ]
-    # PCL pads rows with fields that are all named `_`.
-    rows = [
-        (f"{name}.{n}" if name[0] == "_" else name, _KINDS[kind]) for n, (name, kind) in enumerate(fields)
-    ]
-    missing = [axis for axis in "xyz" if axis not in names]
-    if missing or len({name for name, _ in rows}) < len(rows) or len(rows) > 4096:
+    rows = list[tuple[str, str]]()
+    for name, kind, count in zip(names, kinds, counts, strict=True):
+        # PCL pads rows with fields that are all named `_`.
+        numbered = (f"{name}.{len(rows) + k}" if k or name == "_" else name for k in range(int(count)))
+        rows += [(each, _KINDS[kind]) for each in list(numbered)]
+    fields = {name for name, _ in rows}
+    missing = [axis for axis in "xyz" if axis not in fields]
+    if missing or len(fields) < len(rows):
         what = f"no field {missing[0]}" if missing else "a field named twice"
         raise InputError(path, "FIELDS", what, _FIX)
     count = count_of(path, "POINTS", " ".join(head.get("POINTS", [])))
     if not count:
         raise InputError(path, "POINTS", "has no vertices", _FIX)
     columns = columns_of(path, memoryview(data)[match.end() :], count, rows, "<" if form == "binary" else "")
-    packed = next((name for name in ("rgb", "rgba") if name in columns), None)
-    if packed is not None:
+    if (packed := next((name for name in ("rgb", "rgba") if name in fields), None)) is not None:
         # PCL stores the bytes of a colour as those of a float.
-        as_float = dict(rows)[packed] == "f4"
+        stored_as = np.float32 if dict(rows)[packed] == "f4" else np.uint32
         with np.errstate(all="ignore"):
-            values = columns[packed].astype(np.float32 if as_float else np.uint32)
-        bits = np.ascontiguousarray(values).view(np.uint32)
+            bits = columns[packed].astype(stored_as).view(np.uint32)
         columns |= {
-            name: (bits >> shift).astype(np.uint8) for name, shift in (("red", 16), ("green", 8), ("blue", 0))
+            name: (bits >> n).astype(np.uint8) for name, n in (("red", 16), ("green", 8), ("blue", 0))
         }
     return cloud_of(path, columns)

@@ -115,7 +115,7 @@ def columns_of(
         vertices = np.frombuffer(body, row, count)
         return {name: vertices[name] for name, _ in properties}
     if count > _MAX_ASCII_POINTS:
-        raise InputError(path, "format", f"has {count:,} vertices as text", "Save it as binary PLY")
+        raise InputError(path, "format", f"has {count:,} vertices as text", "Save it in a binary format")
     # A number is a character and a space at least: nothing is allocated for vertices that cannot exist.
     if len(body) < count * (2 * len(properties) - 1):
         raise _short(path, count, len(body) // (2 * len(properties)))

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from datagen.schemas.errors import InputError
+from datagen.train.prediction.files import read_depth
 from datagen.train.prediction.frames import read_place
 
 K = "100 0 15.5\n0 100 11.5\n0 0 1\n"
@@ -80,7 +81,7 @@ def test_the_usual_name_comes_first_and_several_others_are_refused(tmp_path: Pat
 @pytest.mark.parametrize(
     ("gone", "words"),
     [
-        ("color.png", r"color: is missing: the folder has K\.txt, depth\.png\. .*rgb, image.*\.jpg.*rgb"),
+        ("color.png", r"color: is missing: the folder has K\.txt, depth\.png\. .*rgb, image.*\.jpg.*color/"),
         ("depth.png", r"depth: is missing: the folder has K\.txt, color\.png\. .*depth.*\.tiff.*depth/"),
         ("K.txt", r"intrinsics: is missing: the folder has color\.png, depth\.png\. .*camerainfo.*\.yaml"),
     ],
@@ -159,6 +160,37 @@ def test_a_scale_that_cannot_be_is_refused_with_those_that_fit(
         read_place(tmp_path, scale)
 
 
+def test_a_pgm_with_a_long_comment_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "depth.pgm"
+    write_pgm(file, 5000)
+    file.write_bytes(file.read_bytes().replace(b"1 mm", b"1 mm" * 5000))
+    with pytest.raises(InputError, match="Leave out its comments"):
+        read_depth(file)
+
+
+def test_masks_and_poses_of_other_names_are_left_out(tmp_path: Path) -> None:
+    Image.fromarray(np.zeros((24, 32), np.uint8)).save(frame(tmp_path) / "old_mask.png")
+    (tmp_path / "robot_pose.json").write_text("{}")
+    found = read_place(tmp_path)
+    assert found.on_target is None and found.T_world_camera is None
+
+
+@pytest.mark.parametrize("compression", [None, "tiff_lzw"])
+def test_changed_bytes_of_a_tiff_give_an_image_or_one_line(compression: str | None, tmp_path: Path) -> None:
+    file = tmp_path / "depth.tiff"
+    Image.fromarray(STEPS[3:9, :6]).save(file, compression=compression)
+    good, refused = file.read_bytes(), 0
+    for at in range(len(good)):
+        for bit in (0x01, 0x04, 0x80):
+            file.write_bytes(good[:at] + bytes([good[at] ^ bit]) + good[at + 1 :])
+            try:
+                read_depth(file)
+            except InputError as error:
+                refused += 1
+                assert "\n" not in str(error)
+    assert refused > 50
+
+
 HEAD = "VERSION 0.7\nFIELDS x y z rgb _ target\nSIZE 4 4 4 4 1 1\nTYPE F F F {} U U\nCOUNT 1 1 1 1 3 1\n"
 COUNT = "WIDTH {w}\nHEIGHT {h}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\n"
 
@@ -192,6 +224,7 @@ def test_clouds_of_pcl(kind: str, form: str, organised: bool, tmp_path: Path) ->
         (b"FIELDS x y z\nSIZE 4 4\nTYPE F F F\nPOINTS 9\nDATA binary\n", "do not agree"),
         (b"FIELDS x y z\nSIZE 3 4 4\nTYPE F F F\nPOINTS 9\nDATA binary\n", "do not agree"),
         (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 9999\nPOINTS 9\nDATA binary\n", "do not agree"),
+        (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 0 1\nPOINTS 9\nDATA binary\n", "no field y"),
         (b"FIELDS x y\nSIZE 4 4\nTYPE F F\nPOINTS 9\nDATA binary\n", "no field z"),
         (b"FIELDS x y z x\nSIZE 4 4 4 4\nTYPE F F F F\nPOINTS 9\nDATA ascii\n", "named twice"),
         (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 99999999999\nDATA binary\n", "99,999,999,999"),
