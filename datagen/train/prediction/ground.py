@@ -251,7 +251,7 @@ def _floor_towards(
         for steps in STEPS if step_m else ():
             scaled_m = np.array(below_m) / (steps * step_m)
             if np.abs(scaled_m - camera_height_m).min() < _SURE_OFF_M:
-                fix = f"Give --depth-scale {steps}, with which one is there, or: {fix}"
+                fix = f"Give --depth-scale {steps}, with which one is at that height. Else: {fix}"
         return InputError(place, "floor", problem, fix)
     error_m = depth_error_m(points[levels[k], 2])
     # The points' height is a mean of many measurements, the given height is one more.

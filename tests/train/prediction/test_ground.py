@@ -174,5 +174,5 @@ def test_a_floor_at_another_scale_of_depth_names_the_scale(assets: Path) -> None
     image = read_place(assets / "frames" / "tum-fr3-desk").image
     assert image is not None
     five = image_frame(replace(image, depth_m=image.depth_m * 5), None, {})
-    with pytest.raises(InputError, match="Give --depth-scale 5000, with which one is there"):
+    with pytest.raises(InputError, match="Give --depth-scale 5000, with which one is at that height"):
         find_ground(five, 1.711, None)
