@@ -4,9 +4,10 @@
 
 Scenes of the test houses as runs draw them, each frame once exact and once with the stereo noise of
 `workers/rendering/noise.py`, depth in whole millimetres. Centre: error of the estimate from the true mask.
-Click: overlap (intersection over union) of the region grown from the target's middle pixel and the true mask.
+Click: overlap (intersection over union) of the region grown from the target's middle pixel and the true mask,
+0 for a click that is refused.
 Floor: tilt, and the error in the target's height, where it is found from the image and the camera's height;
-wrong where these are above 3 degrees or 40 mm.
+wrong where these are above 3 degrees or 40 mm, doubted where the answer says that the floor is uncertain.
 """
 
 from __future__ import annotations
@@ -62,9 +63,10 @@ def main() -> None:
         floor = np.array([row[3] for row in found])
         missed = sum(row[2] is None and row[3] for row in found)
         wrong = sum(row[2] is not None and (row[2][0] > 3 or row[2][1] > 40) for row in found)
+        unsure = [row[2][2] > 0 for row in found if row[2] is not None and (row[2][0] > 3 or row[2][1] > 40)]
+        print(f"  floor: in {floor.sum()} frames; found in {len(tilts)}, missed in {missed};", end=" ")
         print(
-            f"  floor: in {floor.sum()} frames; found in {len(tilts)}, missed in {missed}, wrong in {wrong};",
-            end=" ",
+            f"doubted in {(tilts[:, 2] > 0).sum()}, wrong in {wrong}, {sum(unsure)} of them doubted;", end=" "
         )
         print(
             f"tilt {np.median(tilts[:, 0]):.2f} deg, target's height off by {np.median(tilts[:, 1]):.1f} mm,",
@@ -112,24 +114,28 @@ def _overlap(scene: Scene, frame: SensorFrame) -> float:
     v, u = np.nonzero(truth)
     middle = [axis.mean() for axis in np.nonzero(image.mask)]
     k = int(np.argmin((v - middle[0]) ** 2 + (u - middle[1]) ** 2))
-    grown = grow_mask(image, (int(u[k]), int(v[k])), scene.camera.T_world_camera)
+    try:
+        grown = grow_mask(image, (int(u[k]), int(v[k])), scene.camera.T_world_camera)
+    except InputError:
+        return 0.0
     return float((grown & truth).sum() / (grown | truth).sum())
 
 
 def _floor(scene: Scene, frame: SensorFrame) -> tuple[F64 | None, bool]:
-    """(tilt in degrees and error of the target's height in mm) or None; whether a floor is in sight."""
+    """(tilt in degrees, error of the target's height in mm, doubted) or None; whether a floor is in sight."""
     true = scene.camera.T_world_camera
     world = frame.points_m @ true[:3, :3].T + true[:3, 3]
     has_floor = bool(floor_points(world, true[:3, 3]).mean() > 0.03)
     unposed = SensorFrame(frame.place, frame.points_m, frame.rgb, frame.on_target, None, frame.image)
     try:
-        found = find_ground(unposed, float(true[2, 3]), None).T_world_camera
+        ground = find_ground(unposed, float(true[2, 3]), None)
     except InputError:
         return None, has_floor
+    found = ground.T_world_camera
     tilt = np.degrees(np.arccos(min(1.0, float(found[2, :3] @ true[2, :3]))))
     centre = np.append(scene.target_center_m, 1.0)
     height = (found @ np.linalg.inv(true) @ centre)[2]
-    return np.array([tilt, 1000 * abs(height - centre[2])]), has_floor
+    return np.array([tilt, 1000 * abs(height - centre[2]), ground.doubt is not None]), has_floor
 
 
 if __name__ == "__main__":

@@ -62,7 +62,9 @@ class Score(nn.Module):
         same, left, centres, valid, *of_target, radius, rise = given[: len(TOKENS)]
         camera_rise, reach, poses, base_xy, rho, codes = given[len(TOKENS) :]
         model, robot = self.model, torch.zeros(AT_ONCE, dtype=torch.int64)
-        tokens = Tokens(centres, valid, same, same, same, *of_target, radius, rise)
+        numbers, vectors, tensors = of_target
+        target_of = (numbers, vectors, tensors, radius, rise)
+        tokens = Tokens(centres, valid, same, same, same, *target_of)
         frames = frames_of(base_xy, *(each[robot] for each in (rise, camera_rise, reach, radius)))
         target, target_left = target_features(frames, tokens, robot)
         scalars = torch.cat([frames.scalars(), target, stretched(rho)], dim=1)
@@ -81,7 +83,8 @@ def exported(
     Each input is a tensor of its own: torch joins those that are the same.
     """
     program = torch.export.export(module, given).run_decompositions()
-    signature, state = program.graph_signature, {**program.state_dict, **program.constants}
+    signature = program.graph_signature
+    state: dict[str, Any] = {**program.state_dict, **program.constants}
     lifted = {**signature.inputs_to_parameters, **signature.inputs_to_buffers}
     lifted |= signature.inputs_to_lifted_tensor_constants
     names, known, steps = dict[Node, str](), dict[str, Any](), list[Step]()
@@ -103,12 +106,7 @@ def exported(
         elif node.op == "placeholder":
             names[node] = f"{name}.{node.name}"
             known[names[node]] = state[lifted[node.name]].detach().numpy()
-        elif not str(node.target).startswith("aten._assert") and all(
-            n in names for n in node.all_input_nodes
-        ):
-            op = str(node.target).split(".")[1] if "." in str(node.target) else node.target.__name__
-            if op not in OPERATIONS:  # checks of sizes, which are fixed
-                continue
+        elif (op := _operation(node)) in OPERATIONS and all(each in names for each in node.all_input_nodes):
             options = {key: plain(value) for key, value in node.kwargs.items() if key == "dtype"}
             step = Step(f"{name}.{node.name}", op, tuple(plain(each) for each in node.args), options)
             names[node] = step.name

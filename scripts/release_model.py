@@ -24,8 +24,8 @@ from datagen.commands.predict import predict
 from datagen.evaluation.report_tables import DECISIONS
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import whole_file
-from datagen.train.prediction import load_scorer
-from datagen.train.scorers import ModelScorer, weights_sha256
+from datagen.train.program_scorer import ProgramScorer
+from datagen.train.scorers import weights_sha256
 from datagen.train.training.checkpoints import Checkpoint, load_model, read_checkpoint, write_checkpoint
 from scripts.export_program import write_program
 
@@ -82,12 +82,12 @@ def facts_of(path: Path, report: dict[str, Any], name: str) -> dict[str, Any]:
     """The card of the shipped checkpoint at `path`."""
     checkpoint = read_checkpoint(path)
     head = checkpoint.head
-    scorer = load_scorer(path)
+    program = ProgramScorer(released.FOLDER / released.PROGRAM)
     return {
         "file": path.name,
         "bytes": path.stat().st_size,
         "sha256": sha256(path.read_bytes()).hexdigest(),
-        "weights_sha256": weights_sha256(scorer.model),
+        "weights_sha256": program.program.facts["weights_sha256"],
         "parameters": sum(tensor.numel() for tensor in checkpoint.weights.values()),
         "model": head.model,
         "config": head.model_config,
@@ -104,7 +104,7 @@ def facts_of(path: Path, report: dict[str, Any], name: str) -> dict[str, Any]:
         "versions": head.versions,
         "benchmark": {key: report["benchmark"][key] for key in ("version", "digest")},
         "metrics": metrics_of(report, name),
-        "demo": demo_answer(scorer),
+        "demo": demo_answer(program),
     }
 
 
@@ -123,7 +123,7 @@ def metrics_of(report: dict[str, Any], name: str) -> dict[str, Any]:
     return found
 
 
-def demo_answer(scorer: ModelScorer) -> dict[str, Any]:
+def demo_answer(scorer: ProgramScorer) -> dict[str, Any]:
     """The result of `datagen predict --demo`, without its pictures."""
     answer = predict(
         scorer,

@@ -55,7 +55,7 @@ def find_base(
         >>> answer.score.shape
         (625,)
     """
-    from datagen.train.prediction.files import checked_pose, valid_depth
+    from datagen.train.prediction.files import checked_pose, scaled_depth
     from datagen.train.prediction.frames import Pinhole, RgbdImage, image_frame
 
     colours, metres, k = np.asarray(rgb), np.asarray(depth), np.asarray(K, np.float64)
@@ -66,10 +66,10 @@ def find_base(
             raise InputError("datagen.find_base", name, f"is {value.dtype} of shape {value.shape}", _FIX)
     if not (np.isfinite(k).all() and k[0, 0] >= 1 and k[1, 1] >= 1):
         raise InputError("datagen.find_base", "K", "has no focal lengths of a pixel or more", _FIX)
-    scale = np.float32(0.001 if metres.dtype == np.uint16 else 1.0)
     chosen = None if mask is None else np.asarray(mask).astype(np.bool_)
     pinhole = Pinhole(*(float(k[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))))
-    image = RgbdImage(colours, valid_depth(metres.astype(np.float32) * scale), pinhole, chosen)
+    depth_m, step_m, notes = scaled_depth(metres, None, "depth")
+    image = RgbdImage(colours, depth_m, pinhole, chosen, step_m=step_m, notes=notes)
     T = None if T_map_camera is None else checked_pose(np.asarray(T_map_camera, np.float64), "T_map_camera")
     maps = map if isinstance(map, list | tuple) else [map]
     return predict(frame=[image_frame(image, T, {})], map=maps, **options)

@@ -100,14 +100,15 @@ class PredictOptions:
         base_height: Height of the arm's mount above the floor (m).
         reach: Reach of the arm from its mount (m).
         demo: Predict on the frame that ships with the package; writes demo.png and demo.html.
-        frame: Frame as a folder, .npz or .ply; several with poses are fused.
+        frame: Frame as a folder, .npz, .ply or .pcd; several with poses are fused.
         click: Pixel u,v on the target in the first frame, where it has no mask.
         camera_height: Height of the frame's camera (m), where it has no pose.
         gravity: Direction of gravity x,y,z in the camera frame (x right, y down).
         robot_camera_height: Height of the robot's own camera (m). [default: that of the frame's camera]
         footprint: Base: radius (m), corners x,y;x,y;... around the mount, x ahead; or a robot.
             [default: as trained]
-        depth_scale: Metres per step of 16-bit depth.
+        depth_scale: Metres per step of depth below 1 (0.001), else steps per metre (1000, 5000).
+            [default: millimetres; floats in metres]
         allow_unseen: Also consider cells of which the floor, or the way there, was not seen.
         map: Map of the floor, map.yaml as Nav2 has it, in which the frames have their poses; repeatable.
         keep_out: Map of which no base may stand on occupied cells, FILE.yaml.
@@ -131,7 +132,7 @@ class PredictOptions:
     ] = None
     robot_camera_height: float | None = None
     footprint: Annotated[Outline | None, Parameter(converter=_text, n_tokens=1, metavar="STR")] = None
-    depth_scale: float = 0.001
+    depth_scale: float | None = None
     allow_unseen: bool = False
     map: Maps = ()
     keep_out: Maps = ()
@@ -150,9 +151,11 @@ class PredictOptions:
             if value is not None and not (math.isfinite(value) and 0 < value <= _LARGEST_M):
                 option, problem = f"--{name.replace('_', '-')}", f"is not between 0 and {_LARGEST_M:g}"
                 raise InputError(option, f"{value:g}", problem, "Give it in metres")
-        if not (math.isfinite(self.depth_scale) and 1e-6 <= self.depth_scale <= 1.0):
-            fix = "Give metres per step: 0.001 for millimetres"
-            raise InputError("--depth-scale", str(self.depth_scale), "is not between 0.000001 and 1", fix)
+        if self.depth_scale is not None and not 1e-6 <= self.depth_scale <= 1e6:
+            fix = "Give metres per step, or steps per metre: 0.001 or 1000 for millimetres"
+            raise InputError(
+                "--depth-scale", str(self.depth_scale), "is not between 0.000001 and 1000000", fix
+            )
 
 
 @prints(print_prediction)
@@ -160,8 +163,9 @@ class PredictOptions:
 def predict(given: PredictOptions) -> Prediction:
     """Score a grid of base poses around a target seen by a depth camera, and name the best clear one.
 
-    A folder of a frame holds color.png, depth.png (16 bits), intrinsics.json (fx, fy, cx, cy, width, height),
-    and optionally mask.png of the target and pose.json (T_world_camera, 4x4, floor at z = 0). The floor is
+    A folder of a frame holds color.png, depth.png (16 bits), intrinsics.json (fx, fy, cx, cy; or as ROS,
+    RealSense or Open3D have it), and optionally mask.png of the target and pose.json (T_world_camera, 4x4,
+    floor at z = 0); other usual names and formats are found too. The floor is
     known from the pose, from --gravity and --camera-height, or from the image and --camera-height. Exit code
     1 where no clear base pose has a good score.
 
@@ -283,13 +287,12 @@ def _direction(given: Sequence[float]) -> F64:
 
 def _refuse_outputs(out: Path | None, html: Path | None, frames: Sequence[Any]) -> None:
     """Raise InputError for an output that is a folder or a picture of a frame."""
-    from datagen.train.prediction.frames import DEPTH, MASK, RGB
+    from datagen.train.prediction.frames import frame_files
 
     if html is not None:
         import_module("datagen.train.prediction.page")  # reports a missing library before scoring
-    read = {
-        (path / name).resolve() for path in frames if isinstance(path, Path) for name in (RGB, DEPTH, MASK)
-    }
+    folders = [path for path in frames if isinstance(path, Path) and path.is_dir()]
+    read = {file.resolve() for folder in folders for file in frame_files(folder).values()}
     for option, file, endings in (("--out", out, (".png", ".pdf", ".svg")), ("--html", html, (".html",))):
         if file is None:
             continue

@@ -54,8 +54,10 @@ class ProgramScorer:
 
         padded = [_of_length(each) for each in (cloud.points_m, cloud.rgb, cloud.target_mask)]
         sizes = (cloud.target_height_m, robot.base_height_m, robot.arm_reach_m)
-        of_cloud = dict(zip(CLOUD, (*padded, cloud.n_points.astype(np.int64), *sizes), strict=True))
-        tokens = dict(zip(TOKENS, self.program.run(ENCODE, of_cloud), strict=True))
+        of_cloud: dict[str, Array] = dict(
+            zip(CLOUD, (*padded, cloud.n_points.astype(np.int64), *sizes), strict=True)
+        )
+        tokens: dict[str, Array] = dict(zip(TOKENS, self.program.run(ENCODE, of_cloud), strict=True))
         n_poses, hands = int(self.program.facts["hand_poses"]), hands_of(robot, 1)
         poses = poses_of_clouds(cloud.points_m, cloud.target_mask, cloud.n_points, n_poses, hands)
         shared = {

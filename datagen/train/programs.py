@@ -195,6 +195,10 @@ def _real(function: Callable[..., Array]) -> Callable[..., Array]:
     return found
 
 
+def _arange(start: int, end: int, step: int = 1, dtype: str = "int64") -> Array:
+    return np.arange(start, end, step).astype(dtype)
+
+
 def _filled_like(x: Array, value: float) -> Array:
     return np.full_like(x, value)
 
@@ -207,7 +211,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "addmm": lambda b, x, w: b + x @ w,
     "amax": _reduced(np.max),
     "amin": _reduced(np.min),
-    "arange": lambda start, end, step=1, dtype="int64": np.arange(start, end, step, dtype),
+    "arange": _arange,
     "bitwise_and": operator.and_,
     "bitwise_not": operator.invert,
     "bmm": operator.matmul,

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import io
 import math
+import re
+import struct
 import warnings
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 from PIL import Image
 
 from datagen.schemas.errors import InputError
@@ -27,12 +31,13 @@ _POSE_ROUNDING = 1e-3
 _EXTENT_M = 1000.0
 # No depth camera measures farther; larger values are saturated.
 MAX_DEPTH_M = 20.0
-# The least and largest value of each.
-_INTRINSICS: dict[str, tuple[float, float]] = {
-    **dict.fromkeys(("fx", "fy"), (1.0, 1e5)),
-    **dict.fromkeys(("cx", "cy"), (-1e5, 1e5)),
-    **dict.fromkeys(("width", "height"), (2, MAX_SIDE_PX)),
-}
+# Medians of depth images of rooms (m), and steps a metre that cameras and data sets have.
+_MEDIAN_M, STEPS = (0.05, 15.0), (1, 1000, 4000, 5000, 10_000)
+# What readers of Pillow raise, above all those of TIFF.
+_DAMAGED_IMAGE = (
+    OSError, ValueError, SyntaxError, EOFError, TypeError, AttributeError, LookupError, ArithmeticError,
+    RuntimeError, struct.error,
+)  # fmt: skip
 NAMES = ("rgb", "depth", "intrinsics", "mask", "T_world_camera")
 _MAX_ARRAY_BYTES = 4 * MAX_PIXELS
 _MAX_RECORDS = 10_000
@@ -42,14 +47,22 @@ _NPZ_FIX = (
 
 
 def read_rgb(path: Path) -> U8:
-    """A colour picture (H, W, 3), PNG or JPEG."""
-    return np.asarray(_opened(path, ("PNG", "JPEG"), "RGB"), np.uint8)
+    """A colour picture (H, W, 3): PNG, JPEG, TIFF or PPM."""
+    return np.asarray(_opened(path, ("PNG", "JPEG", "TIFF", "PPM"), "RGB"), np.uint8)
 
 
 def read_mask(path: Path) -> Bools:
     """Mask (H, W) of the pixels of a PNG that are not black; an alpha channel is ignored."""
     pixels = np.asarray(_opened(path, ("PNG",), "RGB"))
     return np.asarray(pixels.any(axis=2), np.bool_)
+
+
+def parse_yaml(data: bytes, path: Path, fix: str) -> Any:
+    """The first value of a YAML file, also of one of OpenCV. InputError for another one."""
+    try:
+        return next(yaml.safe_load_all(re.sub(rb"(?m)^%.*$|!!opencv-matrix", b"", data)), None)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise InputError(path, "", f"is not YAML ({type(error).__name__})", fix) from None
 
 
 def read_grey(path: Path) -> tuple[U8, U8 | None]:
@@ -59,32 +72,65 @@ def read_grey(path: Path) -> tuple[U8, U8 | None]:
     return np.asarray(image.convert("L"), np.uint8), alpha
 
 
-def read_depth(path: Path, depth_scale_m: float) -> F32:
-    """Depth (H, W) along the camera's z axis, of a 16-bit PNG; 0 where nothing was measured."""
-    image = _opened(path, ("PNG",), None)
-    if not image.mode.startswith("I;16"):
-        fix = "Save depth as a 16-bit grey PNG, in steps of --depth-scale (0.001 m unless given)"
+def read_depth(path: Path) -> Array:
+    """Depth (H, W) as it is stored: uint16 or float of a PNG, TIFF, PGM, .npy, or the array of an .npz."""
+    data = read_regular(path, MAX_FILE_BYTES, FILE_FIX)
+    if data.startswith(b"PK"):
+        found = read_arrays(path, ("depth", "arr_0"))
+        return checked_depth(next(iter(found.values())), path)
+    if data.startswith(b"\x93NUMPY"):
+        return checked_depth(_array(path, "depth", data), path)
+    image = _opened(path, ("PNG", "TIFF", "PPM"), None)
+    if not image.mode.startswith("I") and image.mode != "F":
+        fix = "Save depth as a 16-bit grey PNG, TIFF or PGM, or as floats in metres (TIFF, .npy)"
         raise InputError(path, "", f"is not a 16-bit depth image (its mode is {image.mode})", fix)
-    return valid_depth(np.asarray(image).astype(np.float32) * np.float32(depth_scale_m))
+    values = np.asarray(image)
+    if data[:2] in (b"P2", b"P5") and image.mode == "I":
+        # Pillow scales the values of a PGM from its largest one to 16 bits.
+        words = re.sub(rb"#[^\n]*", b"", data[:10_000]).split(maxsplit=4)
+        if len(words) < 4:
+            raise InputError(path, "", "has a header of more than 10,000 bytes", "Leave out its comments")
+        values = np.rint(values * (int(words[3]) / 65535))
+    return checked_depth(values if image.mode == "F" else np.clip(values, 0, 65535).astype(np.uint16), path)
+
+
+def checked_depth(depth: Array, path: Path) -> Array:
+    """The depth, or an InputError for another shape than (H, W) or another type than uint16 and float."""
+    if depth.ndim != 2 or depth.size > MAX_PIXELS or min(depth.shape) < 2:
+        raise InputError(path, "depth", f"has shape {depth.shape}", "Give depth as (H, W)")
+    if depth.dtype.kind != "f" and (depth.dtype.kind, depth.dtype.itemsize) != ("u", 2):
+        fix = "Give uint16 in steps of --depth-scale, or float in metres"
+        raise InputError(path, "depth", f"has type {depth.dtype}", fix)
+    return depth
+
+
+def scaled_depth(depth: Array, scale: float | None, place: str | Path) -> tuple[F32, float, tuple[str, ...]]:
+    """(depth (H, W) in metres, 0 where nothing was measured; metres a step; notes).
+
+    `scale` is in metres a step below 1, else in steps a metre. Without it whole numbers are millimetres, and
+    floats metres, or millimetres where their median is above 50. InputError for a median that no camera of
+    rooms has: it names the scales that give one.
+    """
+    known = depth[np.isfinite(depth) & (depth > 0)].astype(np.float64)
+    median, whole = float(np.median(known)) if len(known) else 0.0, depth.dtype.kind != "f"
+    step_m = (0.001 if whole or median > 50 else 1.0) if scale is None else min(scale, 1 / scale)
+    why = "16-bit numbers" if whole else f"floats with a median of {median:.4g}"
+    why, metres = why if scale is None else f"--depth-scale {scale:g}", median * step_m
+    if len(known) and not _MEDIAN_M[0] <= metres <= _MEDIAN_M[1]:
+        likely = [f"{n} (median {median / n:.2f} m)" for n in STEPS if 0.3 <= median / n <= 6]
+        fix = f"Give --depth-scale {' or '.join(likely)}" if likely else "Check the camera's depth stream"
+        problem = f"has a median of {metres:.4g} m at {step_m:g} m a step ({why})"
+        raise InputError(place, "depth", problem, fix)
+    note = f"depth was read in steps of {step_m:g} m ({why}): median {metres:.2f} m"
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth_m = valid_depth((depth.astype(np.float64) * step_m).astype(np.float32))
+    return depth_m, step_m, () if scale is not None or step_m == 1 else (note,)
 
 
 def valid_depth(depth_m: F32) -> F32:
     """Depth (H, W) with 0 for values that are not finite, not positive or beyond `MAX_DEPTH_M`."""
     good = np.isfinite(depth_m) & (depth_m > 0) & (depth_m <= MAX_DEPTH_M)
     return np.where(good, depth_m, np.float32(0)).astype(np.float32)
-
-
-def read_intrinsics(path: Path) -> tuple[float, float, float, float, int, int]:
-    """(fx, fy, cx, cy, width, height) of a JSON object (or `ppx`, `ppy`); pixel centres are integers."""
-    node = _document(path)
-    names = {**{name: (name,) for name in _INTRINSICS}, "cx": ("cx", "ppx"), "cy": ("cy", "ppy")}
-    found = {key: n for key, keys in names.items() for k in reversed(keys) if (n := node.find(k))}
-    missing = [" or ".join(names[key]) for key in _INTRINSICS if key not in found]
-    if missing:
-        fix = "Write fx, fy, cx, cy, width and height, in pixels (ppx and ppy serve for cx and cy)"
-        raise InputError(path, ", ".join(missing), "missing", fix)
-    fx, fy, cx, cy, width, height = (found[key].number(*bounds) for key, bounds in _INTRINSICS.items())
-    return fx, fy, cx, cy, int(width), int(height)
 
 
 def read_pose(path: Path) -> F64:
@@ -114,8 +160,8 @@ def checked_pose(T: F64, place: str) -> F64:
     return exact
 
 
-def read_arrays(path: Path) -> dict[str, Array]:
-    """Those of `NAMES` that the archive holds. InputError for objects, zip bombs and other files."""
+def read_arrays(path: Path, names: tuple[str, ...] = NAMES) -> dict[str, Array]:
+    """Those of `names` that the archive holds. InputError for objects, zip bombs and other files."""
     data = read_regular(path, MAX_FILE_BYTES, FILE_FIX)
     found: dict[str, Array] = {}
     try:
@@ -123,7 +169,7 @@ def read_arrays(path: Path) -> dict[str, Array]:
         if data.count(b"PK\1\2") > _MAX_RECORDS:
             raise ValueError("too many records")
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            for name in NAMES:
+            for name in names:
                 if (info := archive.NameToInfo.get(f"{name}.npy")) is not None:
                     with open_member(archive, info) as member:
                         unpacked = member.read(_MAX_ARRAY_BYTES + 1)
@@ -133,7 +179,7 @@ def read_arrays(path: Path) -> dict[str, Array]:
     except DAMAGED_ZIP as error:
         raise InputError(path, "", f"is not a .npz archive ({type(error).__name__})", _NPZ_FIX) from None
     if not found:
-        raise InputError(path, "", f"has none of {', '.join(NAMES)}", _NPZ_FIX)
+        raise InputError(path, "", f"has none of {', '.join(names)}", _NPZ_FIX)
     return found
 
 
@@ -170,8 +216,8 @@ def _opened(path: Path, formats: tuple[str, ...], mode: str | None) -> Image.Ima
     data = io.BytesIO(read_regular(path, MAX_FILE_BYTES, FILE_FIX))
     try:
         with warnings.catch_warnings():
-            # Our own limit, checked below, is stricter than the one that warns.
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            # Our own limit of size is stricter than the one that warns; other warnings are of damaged tags.
+            warnings.simplefilter("ignore")
             with Image.open(data, formats=formats) as image:
                 _refuse_size(path, *image.size)
                 image.load()
@@ -181,7 +227,7 @@ def _opened(path: Path, formats: tuple[str, ...], mode: str | None) -> Image.Ima
         raise
     except InputError:
         raise
-    except (OSError, ValueError, SyntaxError, EOFError) as error:
+    except _DAMAGED_IMAGE as error:
         problem = f"is not a readable {kinds} image ({type(error).__name__})"
         raise InputError(path, "", problem, f"Save it again as {kinds}") from None
 

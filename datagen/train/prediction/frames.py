@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+import re
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -12,42 +16,29 @@ from scipy import ndimage
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import F32, F64, I64, U8, Bools
 from datagen.train.prediction.files import (
-    MAX_PIXELS,
+    checked_depth,
     checked_pose,
     read_arrays,
     read_depth,
-    read_intrinsics,
     read_mask,
     read_pose,
     read_rgb,
-    valid_depth,
+    scaled_depth,
 )
+from datagen.train.prediction.intrinsics import Pinhole, read_intrinsics
+from datagen.train.prediction.pcd import read_pcd
 from datagen.train.prediction.ply import read_ply
 
-DEPTH_SCALE_M = 0.001
-# Files of a folder that holds one frame.
-RGB, DEPTH, INTRINSICS, MASK, POSE = "color.png", "depth.png", "intrinsics.json", "mask.png", "pose.json"
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """Intrinsics in pixels. Pixel (u, v) has its centre at (u, v), as cameras and OpenCV have it."""
-
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-
-    def points(self, u: I64, v: I64, depth_m: F32) -> F32:
-        """Points (N, 3) in the camera's frame, of pixels (N,) with their depths (N,)."""
-        x, y = (u - self.cx_px) / self.fx_px, (v - self.cy_px) / self.fy_px
-        return (np.stack([x, y, np.ones(len(u))], axis=1) * depth_m[:, None]).astype(np.float32)
-
-    def pixels(self, points_m: F64) -> F64:
-        """Pixels (N, 2), u and v, of points (N, 3) in the camera's frame."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x, y = points_m[:, 0] / points_m[:, 2], points_m[:, 1] / points_m[:, 2]
-        return np.column_stack([self.fx_px * x + self.cx_px, self.fy_px * y + self.cy_px])
+# Of each file of a frame's folder: its names before the dot, and its endings. The first are the usual ones.
+_CAMERA = ("*intrinsics", "*intrinsic", "*camerainfo", "camera", "calibration", "calib", "k")
+_FILES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "color": (("*color", "*colour", "*rgb", "image"), ("png", "jpg", "jpeg", "tif", "tiff", "ppm")),
+    "depth": (("*depth",), ("png", "tif", "tiff", "pgm", "npy", "npz")),
+    "intrinsics": (_CAMERA, ("json", "yaml", "yml", "txt")),
+    "mask": (("mask",), ("png",)),
+    "pose": (("pose",), ("json",)),
+}
+_LISTED, _MOST_LISTED = 12, 10_000  # files of a folder that an error names, and that are looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +49,31 @@ class RgbdImage:
     depth_m: F32  # (H, W), along the camera's z axis
     pinhole: Pinhole
     mask: Bools | None  # (H, W), the target's pixels
+    # Where it was undistorted: flat index (H, W) of each pixel in the picture that was given, -1 for none.
+    source: I64 | None = None
+    step_m: float = 0.0  # metres a step of the stored depth; 0 where it is not from a file
+    notes: tuple[str, ...] = ()  # on how the files were read, for the answer
 
     def points(self, pixels: I64, depth_m: F32 | None = None) -> F32:
         """Points (N, 3) in the camera's frame, of flat pixel indices (N,)."""
         v, u = np.divmod(pixels, self.depth_m.shape[1])
         return self.pinhole.points(u, v, (self.depth_m if depth_m is None else depth_m).ravel()[pixels])
+
+    def undistorted(self, source: I64) -> RgbdImage:
+        """The picture of an ideal pinhole; `source` as above. Depth is the nearest pixel's, never a mean."""
+        inside, flat = source >= 0, np.maximum(source, 0)
+        rgb = self.rgb.reshape(-1, 3)[flat] * inside[..., None]
+        mask = None if self.mask is None else self.mask.ravel()[flat] & inside
+        return replace(self, rgb=rgb, depth_m=self.depth_m.ravel()[flat] * inside, mask=mask, source=source)
+
+    def pixel_of(self, u: int, v: int) -> tuple[int, int]:
+        """Where pixel (u, v) of the picture that was given lies in this one."""
+        if self.source is None:
+            return u, v
+        rows, columns = np.divmod(self.source, self.source.shape[1])
+        gap = np.where(self.source >= 0, (rows - v) ** 2 + (columns - u) ** 2, np.iinfo(np.int64).max)
+        row, column = divmod(int(gap.argmin()), self.source.shape[1])
+        return column, row
 
     def cut(self, left: int, top: int, right: int, bottom: int) -> RgbdImage:
         """The part of the picture between these columns and rows, with its pinhole."""
@@ -115,43 +126,99 @@ def read_frame(
     *,
     mask: str | Path | None = None,
     pose: str | Path | None = None,
-    depth_scale_m: float = DEPTH_SCALE_M,
+    depth_scale: float | None = None,
 ) -> SensorFrame:
-    """A frame of two aligned images and a JSON file of intrinsics. InputError for bad or unequal files."""
-    colour, depth_m = read_rgb(Path(rgb)), read_depth(Path(depth), depth_scale_m)
-    fx, fy, cx, cy, width, height = read_intrinsics(Path(intrinsics))
+    """An undistorted frame of two aligned images and intrinsics. InputError for bad or unequal files.
+
+    `depth_scale` is in metres a step below 1, else in steps a metre; None chooses it by the depth image.
+    """
+    colour, stored = read_rgb(Path(rgb)), read_depth(Path(depth))
+    camera, (height, width) = read_intrinsics(Path(intrinsics)), stored.shape
     chosen = None if mask is None else read_mask(Path(mask))
-    if (height, width) != depth_m.shape:
-        problem = f"is {width}x{height}, but the depth image has {_size(depth_m)}"
+    if camera.size_px is not None and camera.size_px != (width, height):
+        problem = f"is {camera.size_px[0]}x{camera.size_px[1]}, but the depth image has {_size(stored)}"
         raise InputError(intrinsics, "width, height", problem, "Give the intrinsics of this stream")
     T = None if pose is None else read_pose(Path(pose))
-    image = RgbdImage(colour, depth_m, Pinhole(fx, fy, cx, cy), chosen)
-    return image_frame(image, T, {"rgb": str(rgb), "depth": str(depth), "mask": str(mask)})
+    depth_m, step_m, notes = scaled_depth(stored, depth_scale, depth)
+    image = RgbdImage(colour, depth_m, camera.pinhole, chosen, step_m=step_m, notes=notes)
+    sources = {"rgb": str(rgb), "depth": str(depth), "mask": str(mask)}
+    frame = image_frame(image, T, sources)
+    if (source := camera.source_pixels(height, width)) is None:
+        return frame
+    note = f"lens distortion ({camera.model or 'Brown-Conrady'}) was undone"
+    image = replace(image.undistorted(source), notes=(*image.notes, note))
+    return image_frame(image, T, sources)
 
 
-def read_place(place: str | Path, depth_scale_m: float = DEPTH_SCALE_M) -> SensorFrame:
-    """The frame of a folder, of an .npz archive or of a .ply cloud.
+def read_place(place: str | Path, depth_scale: float | None = None) -> SensorFrame:
+    """The frame of a folder, an .npz archive or a .ply or .pcd cloud; `depth_scale` as for `read_frame`.
 
-    A folder holds color.png, depth.png, intrinsics.json, and optionally mask.png and pose.json.
+    A folder holds a colour and a depth image, intrinsics, and optionally a mask and a pose, by usual names.
     """
     path = Path(place)
     match path.suffix.lower():
         case ".npz":
-            return _npz_frame(path, depth_scale_m)
-        case ".ply":
-            cloud = read_ply(path)
+            return _npz_frame(path, depth_scale)
+        case ".ply" | ".pcd":
+            cloud = read_ply(path) if path.suffix.lower() == ".ply" else read_pcd(path)
             return SensorFrame(str(path), cloud.points_m, cloud.rgb, cloud.on_target, None, None)
         case _ if path.is_dir():
-            more = [path / name if (path / name).exists() else None for name in (MASK, POSE)]
-            files = (path / RGB, path / DEPTH, path / INTRINSICS)
-            for file in files:
-                if not file.exists():
-                    fix = f"A frame's folder has {RGB}, {DEPTH} and {INTRINSICS}"
-                    raise InputError(file, "", "is missing", fix)
-            return read_frame(*files, mask=more[0], pose=more[1], depth_scale_m=depth_scale_m)
+            files = frame_files(path)
+            for role in ("color", "depth", "intrinsics"):
+                if role not in files:
+                    (patterns, endings), has = _FILES[role], _listed(_names(path)) or "no files"
+                    fix = f"A frame's folder has {', '.join(patterns)} as .{', .'.join(endings)}"
+                    fix += "" if role == "intrinsics" else f", or one image in {patterns[0][1:]}/"
+                    raise InputError(path, role, f"is missing: the folder has {has}", fix)
+            more = {role: files.get(role) for role in ("mask", "pose")}
+            three = (files[role] for role in ("color", "depth", "intrinsics"))
+            return read_frame(*three, **more, depth_scale=depth_scale)
         case _:
-            fix = f"Name a folder with {RGB}, {DEPTH} and {INTRINSICS}, an .npz archive or a .ply cloud"
+            fix = "Name a folder with colour, depth and intrinsics, an .npz archive, or a .ply or .pcd cloud"
             raise InputError(path, "--frame", "is not a frame", fix)
+
+
+def frame_files(folder: Path) -> dict[str, Path]:
+    """Files of a frame's folder, by `color`, `depth`, `intrinsics`, `mask` and `pose`.
+
+    A folder `rgb` or `depth` with one image, as of TUM's data sets, stands for it. InputError for several.
+    """
+    names, found = _names(folder), dict[str, Path]()
+    for role, (patterns, endings) in _FILES.items():
+        stems, usual = [pattern.removeprefix("*") for pattern in patterns], f"{role}.{endings[0]}"
+        like = [name for name in names if _matches(name, patterns, endings)]
+        if not like:
+            inside = [f"{name}/{each}" for name in names if name in stems for each in _names(folder / name)]
+            like = [name for name in inside if name.lower().endswith(endings)]
+        exact = [name for name in like if name.partition(".")[0].lower() in stems]
+        chosen = [usual] if usual in like else exact or like
+        if len(chosen) > 1:
+            problem = f"has {len(chosen)}: {_listed(chosen)}"
+            raise InputError(folder, role, problem, f"Name the one of this frame {usual}")
+        if chosen:
+            found[role] = folder / chosen[0]
+    return found
+
+
+def _matches(name: str, patterns: tuple[str, ...], endings: tuple[str, ...]) -> bool:
+    stem, _, ending = name.lower().rpartition(".")
+    bare = re.sub(r"[^a-z0-9]", "", stem)
+    bare = bare.removesuffix("image") or bare
+    return ending in endings and any(fnmatchcase(bare, pattern) for pattern in patterns)
+
+
+def _names(folder: Path) -> list[str]:
+    """Sorted names of a folder, a bounded number; none of what is no folder, or cannot be read."""
+    try:
+        with os.scandir(folder) as entries:
+            return sorted(entry.name for entry in islice(entries, _MOST_LISTED))
+    except OSError:
+        return []
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + more
 
 
 def image_frame(image: RgbdImage, T_world_camera: F64 | None, sources: dict[str, str]) -> SensorFrame:
@@ -173,30 +240,26 @@ def image_frame(image: RgbdImage, T_world_camera: F64 | None, sources: dict[str,
     return SensorFrame(where["depth"], image.points(pixels), colours, on_target, T_world_camera, image)
 
 
-def _npz_frame(path: Path, depth_scale_m: float) -> SensorFrame:
+def _npz_frame(path: Path, depth_scale: float | None) -> SensorFrame:
     arrays = read_arrays(path)
     for name, shape in (("depth", "(H, W)"), ("rgb", "(H, W, 3)"), ("intrinsics", "(4,)")):
         if name not in arrays:
             raise InputError(path, name, "is missing", f"Add it as an array {shape}")
-    depth, rgb, numbers = arrays["depth"], arrays["rgb"], arrays["intrinsics"]
-    if depth.ndim != 2 or depth.size > MAX_PIXELS or min(depth.shape) < 2:
-        raise InputError(path, "depth", f"has shape {depth.shape}", "Give depth as (H, W)")
-    if depth.dtype.kind != "f" and depth.dtype != np.uint16:
-        fix = "Give uint16 in steps of --depth-scale, or float in metres"
-        raise InputError(path, "depth", f"has type {depth.dtype}", fix)
+    depth, rgb, numbers = checked_depth(arrays["depth"], path), arrays["rgb"], arrays["intrinsics"]
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
         raise InputError(path, "rgb", f"is {rgb.dtype} of shape {rgb.shape}", "Give rgb as uint8 (H, W, 3)")
+    if numbers.shape == (3, 3):
+        numbers = numbers[[0, 1, 0, 1], [0, 1, 2, 2]]
     if numbers.shape != (4,) or not np.isfinite(numbers).all() or (numbers[:2] < 1).any():
-        raise InputError(path, "intrinsics", "are not fx, fy, cx, cy", "Give four numbers, in pixels")
-    scale = 1.0 if depth.dtype.kind == "f" else depth_scale_m
+        fix = "Give four numbers, in pixels, or K (3, 3)"
+        raise InputError(path, "intrinsics", "are not fx, fy, cx, cy", fix)
     mask = arrays.get("mask")
     if mask is not None and mask.ndim != 2:
         raise InputError(path, "mask", f"has shape {mask.shape}", "Give the mask as (H, W)")
     pose = arrays.get("T_world_camera")
-    with np.errstate(over="ignore", invalid="ignore"):
-        metres = valid_depth((depth.astype(np.float64) * scale).astype(np.float32))
-    fx, fy, cx, cy = (float(n) for n in numbers)
-    image = RgbdImage(rgb, metres, Pinhole(fx, fy, cx, cy), None if mask is None else mask.astype(np.bool_))
+    pinhole, marked = Pinhole(*map(float, numbers)), None if mask is None else mask.astype(np.bool_)
+    depth_m, step_m, notes = scaled_depth(depth, depth_scale, path)
+    image = RgbdImage(rgb, depth_m, pinhole, marked, step_m=step_m, notes=notes)
     T = None if pose is None else checked_pose(pose.astype(np.float64), str(path))
     return image_frame(image, T, {name: f"{path}: {name}" for name in ("rgb", "depth", "mask")})
 

@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import F32, F64, I64, Bools
+from datagen.train.prediction.files import STEPS
 from datagen.train.prediction.frames import SensorFrame, moved
 
 _SAMPLE = 20_000  # points used
@@ -20,14 +21,25 @@ _REFITS = 5
 # Errors of neighbouring points are correlated: more points than this make a surface no more certain.
 _INDEPENDENT = 400
 _GIVEN_ERROR_M = 0.01  # error of the camera's height as measured by hand
-# The floor's normal points up in the picture (cosine; 75 degrees), and cameras are hardly rolled (sine).
+# The floor's normal points to a side of the picture (cosine; 75 degrees), hardly turned from it (sine).
 _LEAST_UP, _MOST_ROLL = 0.26, 0.25
+# Sides of the picture (x, y) that may be up, and how the camera is rolled then; the upright one is preferred.
+_SIDES = (
+    (0, -1, "upright"),
+    (1, 0, "90 degrees to the left"),
+    (-1, 0, "90 degrees to the right"),
+    (0, 1, "180 degrees"),
+)
 _BIN_M, _MOST_LEVELS = 0.02, 6
 # Least share of all points on a level surface, and largest share below a floor.
 _LEAST_SHARE, _MOST_BELOW = 0.008, 0.02
 _LEAST_POINTS = 300  # points needed for a residual
 _SURE_SHARE, _SURE_OFF_M = 0.03, 0.03
 _NEIGHBOURS, _TREE_POINTS = 20, 20_000  # for normals of clouds without a picture
+_FACES_UP = 0.8  # cosine to the vertical of surfaces that face up, where it is known roughly
+# The axes of a body (x ahead, y left, z up) in those of its camera, and the highest camera.
+_BODY_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_LOOKS_UP, _STEEPLY_UP, _MOST_UNDER, _HIGHEST_M = 0.26, 0.87, 0.3, 10.0
 _FIX = "Give --gravity x,y,z (direction of gravity, camera frame) or the camera's pose"
 
 
@@ -65,6 +77,7 @@ def find_ground(frame: SensorFrame, camera_height_m: float | None, gravity: F64 
     """
     if frame.T_world_camera is not None:
         T = frame.T_world_camera
+        _refuse_pose(frame, T)
         if camera_height_m is not None and abs(T[2, 3] - camera_height_m) > _tolerance_m(camera_height_m):
             problem = f"is {T[2, 3]:.2f} m in the pose, but --camera-height is {camera_height_m:.2f} m"
             fix = "Correct one of them; the floor of the pose's world is at z = 0"
@@ -75,13 +88,14 @@ def find_ground(frame: SensorFrame, camera_height_m: float | None, gravity: F64 
         raise InputError(frame.place, "camera height", "is missing", fix)
     if gravity is not None:
         down = gravity / np.linalg.norm(gravity)
-        if down[1] < 0 and abs(down[2]) < 0.95:
+        if _points_up(frame, down, camera_height_m):
             fix = "Change its sign: gravity points down, an accelerometer at rest measures the opposite"
-            raise InputError("--gravity", "", "points up in the image", fix)
+            raise InputError("--gravity", "", "points up, by the level surfaces in the image", fix)
         return _with_residual(frame, level_pose(-down, camera_height_m), "gravity and the camera's height")
-    up, height_m, doubt = _floor_plane(frame, camera_height_m)
-    how = f"the floor's plane in the depth, {height_m:.3f} m below the camera ({camera_height_m:.3f} m given)"
-    return replace(_with_residual(frame, level_pose(up, height_m), how), doubt=doubt)
+    floor = _floor_plane(frame, camera_height_m)
+    height_m, given = floor.height_m, f"{camera_height_m:.3f} m given"
+    how = f"the floor's plane in the depth, {height_m:.3f} m below the camera ({given})"
+    return replace(_with_residual(frame, level_pose(floor.up, height_m), how), doubt=floor.doubt)
 
 
 def level_pose(up: F64, height_m: float) -> F64:
@@ -122,19 +136,102 @@ def _with_residual(frame: SensorFrame, T: F64, how: str) -> Ground:
     return Ground(T, how, float(near.std()), float(near.mean()))
 
 
-def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float, str | None]:
-    """(up (3,) in the camera's frame, height of the camera, doubt) of the floor seen in the frame.
+def _refuse_pose(frame: SensorFrame, T: F64) -> None:
+    """Raise InputError for a pose that what the frame shows contradicts: other axes, or another origin."""
+    fix = (
+        "Give T_world_camera of the camera's optical axes (x right, y down, z forward), in a world with z up "
+        "and the floor at z = 0"
+    )
+    z = moved(frame.points_m, T)[:, 2]
+    under = float((z < -0.1 - 4 * depth_error_m(frame.points_m[:, 2])).mean())
+    problem = ""
+    if T[2, 2] > _STEEPLY_UP:
+        problem = f"the camera looks up at {np.degrees(np.arcsin(min(T[2, 2], 1.0))):.0f} degrees"
+    elif T[2, 2] > _LOOKS_UP:
+        _, normals = _sample(frame)
+        level, of_body = ((normals @ up > _LIES_LEVEL).mean() for up in (T[2, :3], T[2, :3] @ _BODY_AXES))
+        if level < _LEAST_SHARE and of_body > _SURE_SHARE:
+            problem = "no surface is level, but many are if its axes are those of a body (x forward, z up)"
+    elif not 0 < T[2, 3] <= _HIGHEST_M:
+        problem = f"the camera is {T[2, 3]:.2f} m above z = 0"
+    elif under > _MOST_UNDER:
+        problem = f"{under:.0%} of the points are below z = 0"
+    if problem:
+        raise InputError(frame.place, "T_world_camera", problem, fix)
+
+
+def _points_up(frame: SensorFrame, down: F64, camera_height_m: float) -> bool:
+    """Whether a direction of gravity (3,) has the wrong sign.
+
+    It has where it shows no floor, fewer surfaces that face up than the opposite, and the opposite shows the
+    floor; at the top of the picture also where neither shows a floor.
+    """
+    points, normals = _sample(frame)
+    floors, facing = list[float](), list[float]()
+    for up in (-down, down):
+        T = level_pose(up, camera_height_m)
+        on_floor = floor_points(moved(points, T), T[:3, 3]) & (normals @ up > _LIES_LEVEL)
+        floors.append(float(on_floor.mean()))
+        facing.append(float((normals @ up > _FACES_UP).mean()))
+    if floors[0] >= _LEAST_SHARE or facing[0] > facing[1]:
+        return False
+    return floors[1] >= _LEAST_SHARE or bool(down[1] < -0.5)
+
+
+def _sample(frame: SensorFrame) -> tuple[F64, F64]:
+    """Some points (N, 3) of a frame, in random order, and their normals (N, 3), in its camera's frame."""
+    rng = np.random.default_rng([0, len(frame.points_m)])
+    rows = rng.choice(len(frame.points_m), min(_SAMPLE, len(frame.points_m)), replace=False)
+    return frame.points_m[rows].astype(np.float64), _normals(frame, rows)
+
+
+@dataclass(frozen=True, eq=False)
+class _Floor:
+    """A floor: up (3,) in the camera's frame, its share of all points, and why it is doubted."""
+
+    up: F64
+    height_m: float
+    share: float
+    doubt: str | None
+
+
+def _floor_plane(frame: SensorFrame, camera_height_m: float) -> _Floor:
+    """The floor seen in the frame; of a rolled camera where an upright one does not see any.
+
+    The floor of a rolled camera and a wall beside an upright one look alike: where both fit, or the rolled
+    one alone, the floor is doubted.
+    """
+    points, normals = _sample(frame)
+    found = [_floor_towards(frame, points, normals, np.array(side[:2]), camera_height_m) for side in _SIDES]
+    rolled = [
+        (floor, roll)
+        for floor, (*_, roll) in zip(found[1:], _SIDES[1:], strict=True)
+        if isinstance(floor, _Floor) and floor.doubt is None
+    ]
+    upright = found[0]
+    if rolled:
+        floor, roll = max(rolled, key=lambda each: each[0].share)
+        if isinstance(upright, InputError):
+            return replace(floor, doubt=f"it fits if the camera is rolled by {roll}")
+        doubt = upright.doubt or f"another surface fits if the camera is rolled by {roll}"
+        return replace(upright, doubt=doubt)
+    if isinstance(upright, InputError):
+        raise upright
+    return upright
+
+
+def _floor_towards(
+    frame: SensorFrame, points: F64, normals: F64, side: F64, camera_height_m: float
+) -> _Floor | InputError:
+    """The floor if a side (2,) of the picture is up, or why there is none.
 
     Up is the common normal of level surfaces. The floor is the level surface nearest to the given height
     below the camera: neither a table's top nor the board of a low shelf.
     """
-    rng = np.random.default_rng([0, len(frame.points_m)])
-    rows = rng.choice(len(frame.points_m), min(_SAMPLE, len(frame.points_m)), replace=False)
-    points, normals = frame.points_m[rows].astype(np.float64), _normals(frame, rows)
-    up = _way_up(normals, rng)
+    place, up = frame.place, _way_up(normals, side)
     levels = [] if up is None else _levels(points, normals, up)
     if up is None or not levels:
-        raise InputError(frame.place, "floor", "is not in the depth image: no level surface", _FIX)
+        return InputError(place, "floor", "is not in the depth image: no level surface", _FIX)
     for _ in range(_REFITS):
         up = _common_up(points, levels, up)
         levels = _levels(points, normals, up) or levels
@@ -150,7 +247,12 @@ def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float
         x, y, z = np.round(-up, 3)
         hint = f"level surfaces suggest {x:g},{y:g},{z:g}"
         fix = f"Correct --camera-height, or, if that surface is not the floor: {_FIX}; {hint}"
-        raise InputError(frame.place, "floor", problem, fix)
+        step_m = 0.0 if frame.image is None else frame.image.step_m
+        for steps in STEPS if step_m else ():
+            scaled_m = np.array(below_m) / (steps * step_m)
+            if np.abs(scaled_m - camera_height_m).min() < _SURE_OFF_M:
+                fix = f"Give --depth-scale {steps}, with which one is at that height. Else: {fix}"
+        return InputError(place, "floor", problem, fix)
     error_m = depth_error_m(points[levels[k], 2])
     # The points' height is a mean of many measurements, the given height is one more.
     weights = 1 / np.array([(error_m.mean() ** 2) / 25 + 0.004**2, _GIVEN_ERROR_M**2])
@@ -158,11 +260,11 @@ def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float
     below = float((points @ up + height_m < -0.03 - 4 * depth_error_m(points[:, 2])).mean())
     if below > _MOST_BELOW:
         problem = f"{below:.0%} of all points are below the plane {height_m:.2f} m under the camera"
-        raise InputError(frame.place, "floor", problem, f"Correct --camera-height, or: {_FIX}")
+        return InputError(place, "floor", problem, f"Correct --camera-height, or: {_FIX}")
     doubts = [f"it has only {share:.1%} of the points"] if share < _SURE_SHARE else []
     if abs(below_m[k] - camera_height_m) > _SURE_OFF_M:
         doubts.append(f"it is {below_m[k]:.3f} m below the camera, {camera_height_m:.3f} m given")
-    return up, height_m, ", and ".join(doubts) or None
+    return _Floor(up, height_m, share, ", and ".join(doubts) or None)
 
 
 def _normals(frame: SensorFrame, rows: I64) -> F64:
@@ -180,14 +282,16 @@ def _normals(frame: SensorFrame, rows: I64) -> F64:
     return facets / np.maximum(np.linalg.norm(facets, axis=1, keepdims=True), 1e-12)
 
 
-def _way_up(normals: F64, rng: np.random.Generator) -> F64 | None:
-    """The direction (3,) of most normals (N, 3) that point up in the picture; None where none does."""
-    upward = normals[(normals[:, 1] < -_LEAST_UP) & (np.abs(normals[:, 0]) < _MOST_ROLL)]
+def _way_up(normals: F64, side: F64) -> F64 | None:
+    """The direction (3,) of most normals (N, 3) that point to a side (2,) of the picture, or None."""
+    across = np.array([side[1], -side[0]])
+    turned = np.abs(normals[:, :2] @ across) < _MOST_ROLL
+    upward = normals[(normals[:, :2] @ side > _LEAST_UP) & turned]
     if len(upward) < _LEAST_SHARE * len(normals):
         return None
-    tried = upward[rng.choice(len(upward), min(_MODES, len(upward)), replace=False)]
     # Normals of walls are perpendicular to it; they vote with less weight, since many are noisy.
-    cosines = normals[:_VOTERS] @ tried.T  # rows are in random order
+    tried = upward[:_MODES]  # rows are in random order
+    cosines = normals[:_VOTERS] @ tried.T
     votes = np.maximum(cosines - _LIES_LEVEL, 0).sum(axis=0) / (1 - _LIES_LEVEL)
     votes += 0.25 * (np.abs(cosines) < 0.05).sum(axis=0)
     up = tried[int(votes.argmax())]

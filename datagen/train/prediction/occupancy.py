@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
 from datagen.train.inputs import F64
-from datagen.train.prediction.files import read_grey
+from datagen.train.prediction.files import parse_yaml, read_grey
 from datagen.workers.json_document import JsonNode
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1  # as in nav_msgs/OccupancyGrid
@@ -73,10 +72,7 @@ class KnownFloor:
 
 def read_map(path: Path) -> OccupancyMap:
     """The map of a YAML file and the picture that it names. InputError for anything else."""
-    try:
-        document = yaml.safe_load(read_regular(path, _MOST_BYTES, _FIX))
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise InputError(path, "", f"is not YAML ({type(error).__name__})", _FIX) from None
+    document = parse_yaml(read_regular(path, _MOST_BYTES, _FIX), path, _FIX)
     node = JsonNode(str(path), "$", document)
     if not isinstance(document, dict) or "image" not in document:
         raise InputError(path, "image", "is missing", _FIX)

@@ -22,11 +22,11 @@ _TYPES = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_FIX = "Save the cloud again as PLY, its vertices first, with x, y and z in metres"
+_FIX = "Save the cloud again as PLY or PCD, with x, y and z in metres"
 
 
 @dataclass(frozen=True, eq=False)
-class PlyCloud:
+class PointFile:
     """Points in the order of the file; grey without colours, `on_target` None without targets."""
 
     points_m: F32  # (N, 3)
@@ -34,7 +34,7 @@ class PlyCloud:
     on_target: Bools | None  # (N,)
 
 
-def read_ply(path: Path) -> PlyCloud:
+def read_ply(path: Path) -> PointFile:
     """The finite vertices of a file: x, y, z, and optionally red, green, blue, and target."""
     data = read_regular(path, MAX_FILE_BYTES, FILE_FIX)
     form, count, properties, start = _header(path, data)
@@ -46,17 +46,21 @@ def read_ply(path: Path) -> PlyCloud:
         what = f"no property {missing[0]}" if missing else "a property named twice"
         raise InputError(path, "element vertex", what, _FIX)
     body = memoryview(data)[start:]
-    columns = _columns(path, body, count, properties, _FORMATS[form])
+    return cloud_of(path, columns_of(path, body, count, properties, _FORMATS[form]))
+
+
+def cloud_of(path: Path, columns: dict[str, npt.NDArray[np.generic]]) -> PointFile:
+    """The finite points of columns x, y, z, and optionally red, green, blue, and target."""
     with np.errstate(over="ignore"):  # doubles beyond float32 are infinite, and are left out below
         points = np.stack([columns[axis].astype(np.float32) for axis in "xyz"], axis=1)
     finite = np.isfinite(points).all(axis=1) & (np.abs(points) < 1e4).all(axis=1)
-    colours = np.full((count, 3), 150, np.uint8)
-    if {"red", "green", "blue"} <= set(names):
+    colours = np.full(points.shape, 150, np.uint8)
+    if {"red", "green", "blue"} <= columns.keys():
         colours = np.stack([_colour(columns[c]) for c in ("red", "green", "blue")], axis=1)
-    on_target = columns["target"] != 0 if "target" in names else None
+    on_target = columns["target"] != 0 if "target" in columns else None
     if not finite.any():
-        raise InputError(path, "element vertex", "no vertex is finite", _FIX)
-    return PlyCloud(points[finite], colours[finite], None if on_target is None else on_target[finite])
+        raise InputError(path, "points", "none is finite", _FIX)
+    return PointFile(points[finite], colours[finite], None if on_target is None else on_target[finite])
 
 
 def _header(path: Path, data: bytes) -> tuple[str, int, list[tuple[str, str]], int]:
@@ -75,7 +79,7 @@ def _header(path: Path, data: bytes) -> tuple[str, int, list[tuple[str, str]], i
             case ["format", kind, *_] if kind in _FORMATS:
                 form = kind
             case ["element", "vertex", n] if not element:
-                element, count = "vertex", _count(path, place, n)
+                element, count = "vertex", count_of(path, place, n)
             case ["element", name, *_]:
                 if not element:
                     raise InputError(path, place, f"element {name[:40]} comes before the vertices", _FIX)
@@ -91,7 +95,8 @@ def _header(path: Path, data: bytes) -> tuple[str, int, list[tuple[str, str]], i
     return form, count, properties, line_end + 1
 
 
-def _count(path: Path, place: str, text: str) -> int:
+def count_of(path: Path, place: str, text: str) -> int:
+    """The number of vertices that a header has. InputError for other text and for too many."""
     if not (text.isascii() and text.isdigit()) or len(text) > 18:
         raise InputError(path, place, f"{text[:40]} is not a number of vertices", _FIX)
     if int(text) > MAX_POINTS:
@@ -99,7 +104,7 @@ def _count(path: Path, place: str, text: str) -> int:
     return int(text)
 
 
-def _columns(
+def columns_of(
     path: Path, body: memoryview, count: int, properties: list[tuple[str, str]], order: str
 ) -> dict[str, npt.NDArray[np.generic]]:
     """Columns (count,) of the vertices; as text where `order` is empty."""
@@ -110,7 +115,7 @@ def _columns(
         vertices = np.frombuffer(body, row, count)
         return {name: vertices[name] for name, _ in properties}
     if count > _MAX_ASCII_POINTS:
-        raise InputError(path, "format", f"has {count:,} vertices as text", "Save it as binary PLY")
+        raise InputError(path, "format", f"has {count:,} vertices as text", "Save it in a binary format")
     # A number is a character and a space at least: nothing is allocated for vertices that cannot exist.
     if len(body) < count * (2 * len(properties) - 1):
         raise _short(path, count, len(body) // (2 * len(properties)))

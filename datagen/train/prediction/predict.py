@@ -259,13 +259,14 @@ def predict(
     allowed = (CLEAR, UNSEEN) if allow_unseen else (CLEAR,)
     seen_from_goal = None if arrival is None else arrival.turned(robot.yaw_rad)
     choice = choose(score, cells, allowed, scorer.threshold, seen_from_goal)
+    read = (note for frame in frames if frame.image is not None for note in frame.image.notes)
+    notes = (*read, *_notes(grounds, filled, cloud))
     doubts = (*robot_notes(scorer, robot), *_hand_doubts(target, robot))
     given = (scorer.name, robot, tuple(frames), tuple(grounds), seen, target, filled, cloud, cells)
-    return Prediction(*given, score, choice, arrival, known, doubts, _notes(grounds, filled, cloud))
+    return Prediction(*given, score, choice, arrival, known, doubts, notes)
 
 
 def _hand_doubts(target: TargetBox, robot: RobotSize) -> tuple[str, ...]:
-    # Imported here: needs the compiler.
     from datagen.train.hands.reach import UNKNOWN_ROBOT
     from datagen.train.hands.sizes import hand_size
 

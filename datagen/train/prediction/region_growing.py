@@ -30,11 +30,12 @@ def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> 
     u, v = click
     if not (0 <= u < w and 0 <= v < h):
         raise InputError("--click", f"{u},{v}", f"is outside the image of {w}x{h}", "Give a pixel u,v in it")
+    u, v = image.pixel_of(u, v)
     depth_m = image.depth_m
     if depth_m[v, u] == 0:
         near = (depth_m[max(v - 15, 0) : v + 16, max(u - 15, 0) : u + 16] > 0).any()
         fix = "Give another pixel of the target" if near else "Take the frame again, or give its mask"
-        raise InputError("--click", f"{u},{v}", "has no depth", fix)
+        raise InputError("--click", f"{click[0]},{click[1]}", "has no depth", fix)
     # Pixels outside the window are farther than `_GROWS_M` from the point.
     around_px = max(image.pinhole.fx_px, image.pinhole.fy_px) * _GROWS_M / max(depth_m[v, u] - _GROWS_M, 0.1)
     n = int(around_px) + 16

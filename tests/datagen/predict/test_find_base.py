@@ -13,7 +13,7 @@ from PIL import Image
 import datagen
 from tests.train.prediction.seen_scenes import Seen, camera_arrays, draw_seen
 
-SIZES = {"base_height": 0.7, "reach": 0.9, "allow_unseen": True}
+SIZES: dict[str, Any] = {"base_height": 0.7, "reach": 0.9, "allow_unseen": True}
 
 
 @pytest.fixture(scope="module")
@@ -27,11 +27,12 @@ def test_arrays_give_the_answer_of_their_files(seen: Seen, made: Path) -> None:
     filed = datagen.predict(frame=[made / "posed"], **SIZES)
     np.testing.assert_allclose(answer.score, filed.score, atol=1e-6)
     assert answer.best == filed.best is not None
-    metres = np.where(depth > 0, depth.astype(np.float32) * np.float32(0.001), np.float32(np.nan))
+    metres = np.where(depth > 0, depth * 0.001, np.nan)
     again = datagen.find_base(rgb, metres, K, T, mask=mask, **SIZES)
     np.testing.assert_allclose(again.score, answer.score, atol=1e-6)
     assert repr(answer).startswith(f"Prediction({answer.level}: x ") and len(repr(answer)) < 100
-    assert Image.open(BytesIO(answer._repr_png_())).size[0] > 500
+    shown = answer._repr_png_()  # pyright: ignore[reportPrivateUsage]
+    assert Image.open(BytesIO(shown)).size[0] > 500
 
 
 def test_a_map_of_arrays_blocks(seen: Seen) -> None:

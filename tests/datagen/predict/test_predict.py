@@ -96,6 +96,33 @@ def test_a_click_and_the_same_frame_as_folder_archive_and_cloud(
     assert found["click"]["target"]["mask_pixels"] == pytest.approx(mask.sum(), rel=0.15)
 
 
+def test_a_frame_as_robots_and_data_sets_have_it(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same frame with TUM's folders and steps, and the camera in a file of ROS."""
+    for source in ("color", "depth", "mask"):
+        image = Image.open(made / "posed" / f"{source}.png")
+        steps = np.asarray(image) * np.uint16(5) if source == "depth" else np.asarray(image)
+        file = tmp_path / {"color": "rgb/1.2.png", "depth": "depth/1.3.png", "mask": "mask.png"}[source]
+        file.parent.mkdir(exist_ok=True)
+        Image.fromarray(steps).save(file)
+    n = json.loads((made / "posed" / "intrinsics.json").read_text())
+    K = [n["fx"], 0, n["ppx"], 0, n["fy"], n["ppy"], 0, 0, 1]
+    (tmp_path / "camera_info.yaml").write_text(f"height: 240\nwidth: 320\nd: [0.0]\nk: {K}\n")
+    (tmp_path / "pose.json").symlink_to(made / "posed" / "pose.json")
+    drop = ("--camera-height",)
+    usual = json_of(capsys, arguments(made, "--frame", str(made / "posed"), drop=drop))
+    own = arguments(made, "--frame", str(tmp_path), "--depth-scale", "5000", drop=drop)
+    found = json_of(capsys, own)
+    np.testing.assert_allclose(found["target"]["center_m"], usual["target"]["center_m"], atol=1e-5)
+    for key in ("x_m", "y_m", "score"):
+        np.testing.assert_allclose(found["best"][key], usual["best"][key], atol=1e-3)
+    read = "depth was read in steps of 0.001 m (16-bit numbers)"
+    assert sum(note.startswith(read) for note in usual["notes"]) == 1
+    assert not any("depth was read" in note for note in found["notes"])
+    refused([*own, "--out", str(tmp_path / "depth" / "1.3.png")], capsys, "is a picture of the frame")
+
+
 def test_a_robots_file_gives_its_sizes_and_the_heading_of_its_side(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

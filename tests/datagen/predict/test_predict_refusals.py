@@ -59,9 +59,14 @@ def bad_files(folder: Path) -> None:
     ):
         (folder / f"{name}.json").write_text(json.dumps({**numbers, **change}))
     (folder / "list.json").write_text("[1, 2")
-    T = np.eye(4)
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
     T[2, 3] = 1.0
-    poses = {"pose_nan": T * np.nan, "pose_mirror": T * [[-1], [1], [1], [1]], "pose_wide": T * 2}
+    poses = {
+        "pose_identity": np.eye(4),
+        "pose_nan": T * np.nan,
+        "pose_mirror": T * [[-1], [1], [1], [1]],
+        "pose_wide": T * 2,
+    }
     for name, pose in poses.items():
         (folder / f"{name}.json").write_text(json.dumps({"T_world_camera": pose.tolist()}))
     (folder / "pose_rows.json").write_text(json.dumps([[1, 0, 0], [0, 1, 0]]))
@@ -107,10 +112,14 @@ REFUSED_FILES: list[tuple[str, str, str]] = [
     ("depth", "nothing.png", "no pixel has depth"),
     ("depth", "huge.png", "pixels"),
     ("depth", "cut.png", "not a readable"),
-    ("depth", "-", "is missing. A frame's folder has color.png"),
+    (
+        "depth",
+        "-",
+        "depth: is missing: the folder has color.png, intrinsics.json, mask.png. A frame's folder has",
+    ),
     ("depth", "crowd", "not a file"),
-    ("intrinsics", "-", "is missing. A frame's folder has color.png"),
-    ("intrinsics", "keys.json", "fx, width"),
+    ("intrinsics", "-", "is missing: the folder has color.png, depth.png, mask.png. A frame's folder has"),
+    ("intrinsics", "keys.json", "fx: missing"),
     ("intrinsics", "other.json", "640x240"),
     ("intrinsics", "words.json", "fx"),
     ("intrinsics", "nan.json", "cx"),
@@ -120,6 +129,11 @@ REFUSED_FILES: list[tuple[str, str, str]] = [
     ("pose", "pose_mirror.json", "rotation"),
     ("pose", "pose_wide.json", "rotation"),
     ("pose", "pose_rows.json", "four"),
+    (
+        "pose",
+        "pose_identity.json",
+        "looks up at 90 degrees. Give T_world_camera of the camera's optical axes (x",
+    ),
     *((name, "fifo.png", "not a file") for name in ("color", "depth", "mask")),
     ("depth", "zero.png", "not a file"),
     ("intrinsics", "fifo.json", "not a file"),
@@ -134,6 +148,8 @@ REFUSED: list[tuple[str, str, str]] = [
     ("--base-height", "nan", "--base-height"),
     ("--reach", "900", "metres"),
     ("--depth-scale", "0", "--depth-scale"),
+    ("--depth-scale", "nan", "--depth-scale"),
+    ("--depth-scale", "5000", "Give --depth-scale 1000"),
     ("--gravity", "0,0,0", "--gravity"),
     ("--gravity", "0,1", "--gravity"),
     ("--gravity", "0,nan,1", "--gravity"),
