@@ -64,6 +64,7 @@ EXTRAS: dict[str, Extra] = {
             **_PICTURES,
         },
     ),
+    "ros": Extra("predict from recordings of ROS 2, goals as MCAP", {"rosbags": "rosbags"}),
     "score": Extra("benchmark score of files of scores and of rules", _PICTURES),
     "cluster": Extra("workers of Ray: several processes, several machines", {"ray": "ray"}),
     "tables": Extra(
