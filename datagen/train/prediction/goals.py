@@ -60,10 +60,10 @@ def write_goal(file: Path, p: Prediction, frame_id: str, stamp_ns: int) -> bool:
 
 
 def alternatives(p: Prediction) -> list[int]:
-    """Rows of up to five base poses, unlike the best and each other: good ones first, then by score."""
+    """Rows of up to five base poses, unlike the best and each other: fewest doubts first, then by score."""
     assert p.best is not None
     chosen = [p.best]
-    for row in sorted(p.choice.ranked.tolist(), key=lambda each: bool(p.doubts_about(each))):
+    for row in sorted(p.choice.ranked.tolist(), key=lambda each: len(p.doubts_about(each))):
         gap_m = np.linalg.norm(p.base_xy_m[chosen] - p.base_xy_m[row], axis=1)
         turn = np.abs((p.yaw_rad[chosen] - p.yaw_rad[row] + np.pi) % (2 * np.pi) - np.pi)
         if len(chosen) <= _MOST and ((gap_m >= _APART_M) | (turn >= _APART_RAD)).all():

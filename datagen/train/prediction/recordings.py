@@ -125,11 +125,11 @@ def _take(bag: Bag, topics: Mapping[str, str], at_s: float | None) -> tuple[Sens
     time_ns = bag.end_ns if at_s is None else bag.start_ns + int(at_s * 1e9)
     problem: InputError | None = None
     for window in windows(time_ns):
-        stamps: dict[str, list[tuple[int, int]]] = {topics["color"]: [], topics["depth"]: []}
+        stamps: dict[str, list[tuple[int, int]]] = {topics[role]: [] for role in ("color", "depth")}
         for topic, recorded_ns, data in bag.messages(list(stamps), window):
             seconds, ns = struct.unpack_from("<iI" if data[1] else ">iI", data, 4)
             stamps[topic].append((seconds * 10**9 + ns, recorded_ns))
-        colours, depths = stamps.values()
+        colours, depths = stamps[topics["color"]], stamps[topics["depth"]]
         pairs = [
             (color, depth)
             for depth in sorted(depths, key=lambda each: abs(each[1] - time_ns))[:_TRIES]
