@@ -33,10 +33,10 @@ from datagen.schemas.run_records import StageClock
 from datagen.schemas.shard_reading import read_scenes
 from datagen.train.bootstrap import resample_weights, resampled_area_under_roc
 from datagen.train.encoded_runs import EncodedBatches, EncodedRuns, encode_runs, encoded_stream
+from datagen.train.hands.poses import HAND_WIDTH, N_MEASURES
 from datagen.train.inputs import F32, F64, Array, Bools
 from datagen.train.metrics import area_under_roc
 from datagen.train.models import Model, build_model
-from datagen.train.models.hand_poses import HAND_WIDTH, N_MEASURES
 from datagen.train.models.shared import SharedModel
 from datagen.train.tensors import to_torch
 from datagen.train.training.loop import Position, Training, make_optimiser, run_training

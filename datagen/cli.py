@@ -80,7 +80,10 @@ _HEADINGS: dict[str, dict[str, tuple[str, str]]] = {
 VERBS = {verb: defined for verbs in _HEADINGS.values() for verb, defined in verbs.items()}
 
 # The extra to name for a verb where several extras contain the missing library.
-_EXTRA_OF: dict[str, str] = dict.fromkeys(_HEADINGS["Models"], "train") | {"benchmark": "score"}
+_EXTRA_OF: dict[str, str] = dict.fromkeys(_HEADINGS["Models"], "train") | {
+    "benchmark": "predict",
+    "predict": "predict",
+}
 
 
 def build_app(called: str = "") -> App:

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from datagen.train.models.hand_size import measured_hand
-from datagen.workers.motion.pose_reach import KNOWN_ARMS, measured_arm, reaches_of, size_row
+from datagen.train.hands.sizes import measured_hand
+from datagen.workers.motion.measured_reach import measured_arm, reaches_of, size_row
+from datagen.workers.motion.pose_reach import KNOWN_ARMS
 from datagen.workers.robots import ROBOTS, gripper_of, robot_digest
 
 

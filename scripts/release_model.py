@@ -1,10 +1,10 @@
 """Put a checkpoint into the package as the released model, with its card.
 
-    python scripts/release_model.py CKPT BENCHMARK.json
+    python -m scripts.release_model CKPT BENCHMARK.json
 
 BENCHMARK.json is the output of `datagen benchmark score CKPT ... --out BENCHMARK.json`. The optimiser's state
-is left out of the shipped file. `datagen/released/recipe.md` describes how the model is made: write it first.
-The card includes the result of the demonstration.
+is left out of the shipped file, and its program for NumPy is written beside it. `datagen/released/recipe.md`
+describes how the model is made: write it first. The card includes the result of the demonstration.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from datagen.schemas.safe_files import whole_file
 from datagen.train.prediction import load_scorer
 from datagen.train.scorers import ModelScorer, weights_sha256
 from datagen.train.training.checkpoints import Checkpoint, load_model, read_checkpoint, write_checkpoint
+from scripts.export_program import write_program
 
 Facts = Mapping[str, Any]
 
@@ -243,6 +244,7 @@ def main() -> int:
     try:
         report, name = results_of(options.benchmark, options.checkpoint)
         ship(options.checkpoint, target)
+        write_program(target, released.FOLDER / released.PROGRAM)
         card = facts_of(target, report, name)
     except InputError as error:
         sys.stderr.write(f"error: {error}\n")

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -58,13 +59,18 @@ def print_prediction(
         print_json(document(prediction))
     else:
         if demo:
-            out, html = out or DEMO_PICTURE, html or DEMO_PAGE
+            out, html = out or DEMO_PICTURE, html or _demo_page()
         files = ("picture", out), ("page", html), ("goal", goal)
         written = [(name, str(file)) for name, file in files if file is not None]
         if goal is not None and prediction.best is None:
             written[-1] = ("goal", f"none: {goal} is not written")
         print_rows(f"base poses by {prediction.scorer}", [*report_rows(prediction), *written])
     return 0 if prediction.best is not None else 1
+
+
+def _demo_page() -> Path | None:
+    """None where the library of pages is not installed."""
+    return DEMO_PAGE if find_spec("plotly") else None
 
 
 def _pixel(kind: Any, tokens: Sequence[Token]) -> tuple[int, int]:
@@ -218,7 +224,7 @@ def predict(given: PredictOptions) -> Prediction:
             base_height=given.base_height or DEMO_BASE_HEIGHT_M,
             reach=given.reach or DEMO_REACH_M,
             out=given.out or DEMO_PICTURE,
-            html=given.html or DEMO_PAGE,
+            html=given.html or _demo_page(),
         )
     name = given.robot or ""
     given, yaw_rad = (given, 0.0) if given.robot is None else _of_robot(given, given.robot)

@@ -21,7 +21,7 @@ from datagen.schemas.errors import printable
 
 _WIDTH_IN = 11.0  # at 800 pixels, as pages show pictures, text of 10 points is then 10 pixels high
 _DPI = 120
-_LINE_IN = 0.152  # of facts
+_LINE_IN, _TEXT_POINTS = 0.19, 60  # of facts: height of a line, and where texts begin
 _MOST_CHARACTERS = 60  # in a name: a longer one leaves no room for axes
 
 
@@ -50,17 +50,20 @@ def draw_frame(axes: Axes, rgb: Any, target: Any, title: str = "RGB frame, targe
     axes.set_title(title)
 
 
-def write_facts(axes: Axes, facts: Sequence[tuple[str, str]], head_characters: int = 12) -> float:
+def write_facts(axes: Axes, facts: Sequence[tuple[str, str]]) -> float:
     """Write (head, text) pairs into a panel of half the sheet's width; returns the height in inches."""
     axes.set_axis_off()
-    indent = " " * head_characters
-    lines = [
-        textwrap.fill(f"{head:<{head_characters}}{text}", 66, subsequent_indent=indent)
-        for head, text in facts
-    ]
-    text = "\n".join(lines)
-    axes.text(0, 1, text, va="top", family="monospace", fontsize=9, transform=axes.transAxes)
-    return _LINE_IN * (text.count("\n") + 3)
+    line = 0
+    for head, text in facts:
+        for k, part in enumerate(textwrap.wrap(text, 68) or [""]):
+            for x, words, colour in ((0, "" if k else head, "#555555"), (_TEXT_POINTS, part, "black")):
+                at: dict[str, Any] = {"xytext": (x, -72 * _LINE_IN * line), "textcoords": "offset points"}
+                drawn = axes.annotate(
+                    words, (0, 1), xycoords="axes fraction", va="top", fontsize=9, color=colour, **at
+                )
+                drawn.set_in_layout(False)
+            line += 1
+    return _LINE_IN * (line + 2)
 
 
 def plain(text: str) -> str:

@@ -108,7 +108,7 @@ def draw_scene_picture(shown: Shown, out: Path) -> Lines:
     positive = f"{int(samples['label'].sum())} of {len(samples['label'])} candidates"
     best = [(head, _described(shown, row)) for head, (row, _) in _picks(samples).items()]
     texts_in = (
-        write_facts(facts_ax, [*_facts(shown), ("positive", positive), *best], 15),
+        write_facts(facts_ax, [*_facts(shown), ("positive", positive), *best]),
         draw_legend(legend_ax, [*legend, *marks]),
     )
     # As high as its longer text: four robots and a dozen outcomes need twice the room of a short list.

@@ -9,7 +9,7 @@ from datagen.schemas.errors import InputError
 
 RELEASED = "released"
 FOLDER = Path(str(files("datagen.released")))
-CHECKPOINT, FRAME = "model.safetensors", "frame"
+CHECKPOINT, PROGRAM, FRAME = "model.safetensors", "program.safetensors", "frame"
 # The facts, how the model was made, and the page of both.
 CARD, RECIPE, CARD_PAGE = "card.json", "recipe.md", "MODEL_CARD.md"
 # The click (a pixel on the blue cup) and the robot of `datagen predict --demo` on the sample frame.
@@ -20,6 +20,11 @@ DEMO_BASE_HEIGHT_M, DEMO_REACH_M = 0.7, 0.9
 def released_checkpoint() -> Path:
     """The checkpoint of the released model."""
     return _shipped_path(CHECKPOINT)
+
+
+def released_program() -> Path:
+    """The released model as NumPy's operations (`datagen.train.programs`)."""
+    return _shipped_path(PROGRAM)
 
 
 def checkpoint_file(name: str) -> str | None:

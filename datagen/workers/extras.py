@@ -54,18 +54,22 @@ EXTRAS: dict[str, Extra] = {
             "example-robot-data": "example-robot-data",
         },
     ),
+    "predict": Extra(
+        "predict with the released model, benchmark score of files of scores and of rules",
+        {"safetensors": "safetensors", "yaml": "pyyaml", **_PICTURES},
+    ),
     "train": Extra(
-        "train, evaluate, predict",
+        "train, evaluate; predict with other models and as a page",
         {
             "torch": "torch",
             "numba": "numba",
             "safetensors": "safetensors",
             "plotly": "plotly",
+            "yaml": "pyyaml",
             **_PICTURES,
         },
     ),
     "ros": Extra("predict from recordings of ROS 2, goals as MCAP", {"rosbags": "rosbags"}),
-    "score": Extra("benchmark score of files of scores and of rules", _PICTURES),
     "cluster": Extra("workers of Ray: several processes, several machines", {"ray": "ray"}),
     "tables": Extra(
         "open_dataset and candidates: xarray and pandas", {"pandas": "pandas", "xarray": "xarray"}

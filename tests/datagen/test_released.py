@@ -21,8 +21,9 @@ from datagen import cli, released
 from datagen.evaluation.benchmark import read_benchmark
 from datagen.evaluation.methods import open_models
 from datagen.schemas.specification import PLACE_KINDS
+from datagen.train.programs import read_program
 from datagen.train.scorers import weights_sha256
-from datagen.train.training.checkpoints import read_checkpoint
+from datagen.train.training.checkpoints import load_model, read_checkpoint
 from scripts.release_model import card_text
 from tests.conftest import REPOSITORY
 from tests.refusals import refused
@@ -42,8 +43,8 @@ def test_the_file_the_benchmark_and_the_page_are_those_of_the_card() -> None:
     data = path.read_bytes()
     assert len(data) == card["bytes"] < 5_000_000
     assert hashlib.sha256(data).hexdigest() == card["sha256"]
-    scorer = datagen.load_scorer()
-    assert weights_sha256(scorer.model) == card["weights_sha256"]
+    assert weights_sha256(load_model(path)[0]) == card["weights_sha256"]
+    assert datagen.load_scorer().program.facts["weights_sha256"] == card["weights_sha256"]
     checkpoint = read_checkpoint(path)
     head = checkpoint.head
     assert not checkpoint.resume  # nothing of the optimiser
@@ -129,7 +130,7 @@ def test_releasing_another_model_writes_file_and_card(
     copy = tmp_path / "released"
     shutil.copytree(FOLDER, copy)
     monkeypatch.setattr(released, "FOLDER", copy)
-    write_untrained(tmp_path / "model.ckpt", MODEL)
+    write_untrained(tmp_path / "model.ckpt", MODEL | {"kinematics": True})
     scorer = datagen.load_scorer(tmp_path / "model.ckpt")
     value = {"value": 0.5, "low": 0.4, "high": 0.6}
     metrics = dict.fromkeys(("accuracy", "balanced_accuracy", "area_under_roc"), value)
@@ -158,5 +159,6 @@ def test_releasing_another_model_writes_file_and_card(
     card = json.loads((copy / released.CARD).read_bytes())
     assert card["weights_sha256"] == weights_sha256(scorer.model)
     assert card["bytes"] == (copy / released.CHECKPOINT).stat().st_size
+    assert read_program(copy / released.PROGRAM).facts["weights_sha256"] == card["weights_sha256"]
     assert card["sha256"][:12] in (copy / released.CARD_PAGE).read_text()
     assert card["metrics"]["test"]["balanced_accuracy"] == value

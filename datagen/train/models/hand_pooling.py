@@ -10,8 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from datagen.train.hands.poses import N_MEASURES
 from datagen.train.models.frames import Frames
-from datagen.train.models.hand_poses import N_MEASURES
 from datagen.train.models.tokens import turned
 
 _WRIST_M, _WAY_M = 0.2, 0.1  # from the TCP back to the wrist; before the grasp, and up

@@ -25,6 +25,8 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
+from datagen.train.hands.poses import poses_of_clouds
+from datagen.train.hands.reach import N_STAGES, hand_reach, hands_of
 from datagen.train.inputs import CandidateInputs, Clouds, RobotInputs
 from datagen.train.models.crop import crop_clouds, take_rows
 from datagen.train.models.frames import (
@@ -36,8 +38,6 @@ from datagen.train.models.frames import (
     target_features,
 )
 from datagen.train.models.hand_pooling import N_SEEN_FROM_MOUNT, HandPooling
-from datagen.train.models.hand_poses import poses_of_clouds
-from datagen.train.models.hand_reach import N_STAGES, hand_reach, hands_of
 from datagen.train.models.model import Model, ModelConfig, read_config
 from datagen.train.models.tiles import tiles
 from datagen.train.models.tokens import (
@@ -75,8 +75,8 @@ class SharedConfig(ModelConfig):
 
     `camera`: "given", or "unknown" as for `paper`, which has the height of the mount and not of the camera.
     `observed_visibility`: add rho, estimated on the CPU from the robot's crop. `hand_poses`: number of poses
-    of a hand at the target (`hand_poses.py`); 0 for none. `mirrored`: treat left and right alike.
-    `kinematics`: poses of the robot's own hand, and how easily its own arm brings it there (`hand_reach.py`).
+    of a hand at the target (`hands/poses.py`); 0 for none. `mirrored`: treat left and right alike.
+    `kinematics`: poses of the robot's own hand, and how easily its arm brings it there (`hands/reach.py`).
     """
 
     n_points: int = Field(default=1024, ge=1, le=65_536)
@@ -211,12 +211,12 @@ class SharedModel(Model):
             if self.sizes.observed_visibility:
                 parts.append(stretched(self.visible_share(tokens, clouds, candidates, robots)))
             scalars = torch.cat(parts, dim=1)
-        same, left = self._steered(tokens)
+        same, left = self.steered(tokens)
         condition, condition_left = self.condition(scalars), self.condition_left(target_left)
         size = _TILE_CUDA if scalars.is_cuda else _TILE_CPU
         cut = tiles(candidates.robot_row, size)
         pooled = [
-            self._pool(
+            self.pool(
                 same[robot],
                 left[robot],
                 take_rows(frames, rows),
@@ -291,7 +291,7 @@ class SharedModel(Model):
         of_robots = (t[row] for t in (rise_m, camera_rise_m, reach_m, tokens.target_radius_m))
         return frames_of(candidates.base_xy_m, *of_robots)
 
-    def _steered(self, tokens: Tokens) -> tuple[Tensor, Tensor]:
+    def steered(self, tokens: Tokens) -> tuple[Tensor, Tensor]:
         """The tokens' linear part, to be multiplied with 1 and `Frames.steering`.
 
         (R, 5, J, W) that a mirror leaves unchanged, (R, 4, J, W) whose sign it changes.
@@ -311,7 +311,7 @@ class SharedModel(Model):
             left += [y @ weight_left.T, -x @ weight_left.T]
         return torch.stack(same, dim=1), torch.stack(left, dim=1)
 
-    def _pool(
+    def pool(
         self,
         same: Tensor,
         left: Tensor,

@@ -43,6 +43,12 @@ class Pinhole:
         x, y = (u - self.cx_px) / self.fx_px, (v - self.cy_px) / self.fy_px
         return (np.stack([x, y, np.ones(len(u))], axis=1) * depth_m[:, None]).astype(np.float32)
 
+    def pixels(self, points_m: F64) -> F64:
+        """Pixels (N, 2), u and v, of points (N, 3) in the camera's frame."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y = points_m[:, 0] / points_m[:, 2], points_m[:, 1] / points_m[:, 2]
+        return np.column_stack([self.fx_px * x + self.cx_px, self.fy_px * y + self.cy_px])
+
 
 @dataclass(frozen=True, eq=False)
 class RgbdImage:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from itertools import pairwise
 from typing import IO, Any
 
 import numpy as np
@@ -15,8 +16,9 @@ from matplotlib.patches import Patch, Polygon
 
 from datagen.display.figures import draw_frame, new_sheet, save_sheet, write_facts
 from datagen.display.styles import BEST, CAMERA, SCORE_COLOURS, TARGET
-from datagen.train.inputs import I64
+from datagen.train.inputs import F64, I64
 from datagen.train.prediction.base_cells import BLOCKED, CLEAR, STATES, UNREACHABLE, UNSEEN
+from datagen.train.prediction.frames import RgbdImage
 from datagen.train.prediction.predict import Prediction
 from datagen.train.prediction.prediction_report import report_rows
 
@@ -30,6 +32,8 @@ _LOOK: dict[str, tuple[Any, float, str]] = {
     UNREACHABLE: (0.42 * _DIAMOND, 0.9, "none"),
 }
 _MOST_POINTS = 6_000
+_BEHIND_M = 0.05  # what is nearer than the floor by more hides it
+_NEAREST_M = 0.05  # before a camera; nearer points are not in its picture
 _MAP_COLOURS = ("#e8eef4", "#4a4a4a")  # of free and of occupied floor
 
 
@@ -40,16 +44,48 @@ def draw_prediction(prediction: Prediction, out: IO[bytes]) -> None:
     figure = new_sheet(title, 7.0)
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(1, 1.15))).tolist()
     frame, facts = left.subplots(2, 1, height_ratios=(1, 1.05))
-    image = next((f.image for f in prediction.frames if f.image and f.image.mask is not None), None)
     frame.set_axis_off()
-    if image is not None:
-        draw_frame(frame, image.rgb, image.mask)
-    write_facts(facts, report_rows(prediction), head_characters=9)
+    shown = zip(prediction.frames, prediction.grounds, strict=True)
+    seen = [(f.image, ground) for f, ground in shown if f.image is not None and f.image.mask is not None]
+    if seen:
+        image, ground = seen[0]
+        draw_frame(frame, image.rgb, image.mask, "target outlined, base on the floor")
+        _draw_base(frame, prediction, image, ground.T_world_camera)
+    write_facts(facts, report_rows(prediction))
     plan = right.subplots()
     scale = ScalarMappable(Normalize(0, 1), SCORE_COLOURS)
     right.colorbar(scale, ax=plan, shrink=0.75, label="score (0 bad, 1 good)")
     _draw_plan(plan, prediction, scale)
     save_sheet(figure, out)
+
+
+def _draw_base(axes: Axes, prediction: Prediction, image: RgbdImage, T_world_camera: F64) -> None:
+    """Draw the best base and its heading on the floor of the picture, where they are in view."""
+    if prediction.best is None:
+        return
+    xy, yaw = prediction.base_xy_m[prediction.best], float(prediction.yaw_rad[prediction.best])
+    corners = prediction.robot.outline.outline(xy, yaw)
+    ahead = np.linspace(xy, xy + 0.38 * np.array([np.cos(yaw), np.sin(yaw)]), 20)
+    height, width = image.depth_m.shape
+    for line in (_dense(np.concatenate([corners, corners[:1]])), ahead):
+        points = (np.insert(line, 2, 0.0, axis=1) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+        u, v = image.pinhole.pixels(points).T
+        u[points[:, 2] < _NEAREST_M] = np.nan  # ends the line
+        row, column = (
+            np.clip(np.nan_to_num(p).astype(np.int64), 0, n - 1) for p, n in ((v, height), (u, width))
+        )
+        near_m = image.depth_m[row, column]
+        hidden = (near_m > 0) & (near_m < points[:, 2] - _BEHIND_M)
+        for shown, style in ((np.where(hidden, np.nan, u), "-"), (np.where(hidden, u, np.nan), ":")):
+            for colour, thick in (("black", 5), (BEST.colour, 3)):
+                axes.plot(shown, v, style, color=colour, lw=thick if style == "-" else thick / 2)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+
+
+def _dense(line_m: F64) -> F64:
+    """Points (M, 2) along a line of corners (N, 2)."""
+    parts = [np.linspace(a, b, 24) for a, b in pairwise(line_m)]
+    return np.concatenate(parts)
 
 
 def shown_rows(prediction: Prediction, most: int, around_m: float) -> I64:

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from datagen.released import RELEASED, released_checkpoint
+from datagen.released import RELEASED, released_program
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import CandidateParams, ObservationParams
 from datagen.train.arrivals import Arrival
@@ -37,6 +37,7 @@ from datagen.train.prediction.occupancy import KnownFloor
 from datagen.train.prediction.region_growing import grow_mask
 from datagen.train.prediction.target import Filled, TargetBox, fill_target, locate
 from datagen.train.prediction.trained_robots import robot_notes, trained_robots
+from datagen.train.program_scorer import ProgramScorer
 from datagen.train.scorers import ModelScorer, Scorer, scored
 from datagen.workers.geometry.transforms import inverse, yaw_pose
 from datagen.workers.rendering.cloud import Cloud
@@ -45,7 +46,7 @@ from datagen.workers.rendering.cloud import Cloud
 _RANK = 10
 _SURE, _LIKELY = 0.8, 0.5
 # Robots stop that far from their goals; less of the surroundings seen than this share says little.
-_LEAST_MISS_M, _LEAST_SEEN = 0.05, 0.1
+_LEAST_MISS_M, _LEAST_SEEN = 0.03, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +184,7 @@ class Prediction:
 _CROP = ObservationParams()
 
 
-def load_scorer(checkpoint: str | Path | None = None) -> ModelScorer:
+def load_scorer(checkpoint: str | Path | None = None) -> ModelScorer | ProgramScorer:
     """The model of a checkpoint, ready to predict many frames: `datagen.predict` accepts it as `checkpoint`.
 
     Args:
@@ -203,12 +204,13 @@ def load_scorer(checkpoint: str | Path | None = None) -> ModelScorer:
         >>> len(answers)
         2
     """
-    # Imported here: frames are read and refused without torch.
+    if checkpoint is None or checkpoint == RELEASED:
+        return ProgramScorer(released_program(), "the released model, ")
+    # Imported here: the released model needs no torch.
     from datagen.train.training.checkpoints import load_model
 
-    which = "the released model, " if checkpoint is None or checkpoint == RELEASED else ""
-    model, head = load_model(released_checkpoint() if which else str(checkpoint))
-    name, side_deg = f"{which}{head.model} ({head.stage})", trained_side_deg(head)
+    model, head = load_model(str(checkpoint))
+    name, side_deg = f"{head.model} ({head.stage})", trained_side_deg(head)
     return ModelScorer(model, name, robots=trained_robots(head), side_deg=side_deg)
 
 
@@ -237,7 +239,7 @@ def predict(
     with the highest expected success. A map of the floor that is `known` is in the frame of the poses of the
     frames. InputError where arguments are missing or invalid.
     """
-    if isinstance(scorer, ModelScorer):
+    if isinstance(scorer, (ModelScorer, ProgramScorer)):
         side_deg = 0.0 - math.degrees(robot.yaw_rad)
         refuse_other_heading("datagen predict", "--robot", side_deg, scorer.name, scorer.side_deg)
     if known is not None and any(frame.T_world_camera is None for frame in frames):
@@ -271,8 +273,8 @@ def predict(
 
 def _hand_doubts(target: TargetBox, robot: RobotSize) -> tuple[tuple[str, str], ...]:
     # Imported here: needs the compiler.
-    from datagen.train.models.hand_reach import UNKNOWN_ROBOT
-    from datagen.train.models.hand_size import hand_size
+    from datagen.train.hands.reach import UNKNOWN_ROBOT
+    from datagen.train.hands.sizes import hand_size
 
     opens_m = hand_size(robot.name or UNKNOWN_ROBOT).stroke_m
     if target.narrowest_m <= opens_m:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from datagen.train.dataset import ROBOT_SIZES
 from datagen.train.prediction.base_cells import RobotSize
+from datagen.train.program_scorer import ProgramScorer
 from datagen.train.scorers import ModelScorer, Scorer
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def trained_robots(head: CheckpointHead) -> dict[str, tuple[float, float]]:
 
 def robot_notes(scorer: Scorer, robot: RobotSize) -> Iterator[str]:
     """A note for each size of the robot that is a centimetre or more beyond those of the training data."""
-    if not isinstance(scorer, ModelScorer):
+    if not isinstance(scorer, (ModelScorer, ProgramScorer)):
         return
     for name, (low, high) in scorer.robots.items():
         size_m, words = getattr(robot, name), name.removesuffix("_m").replace("_", " ")

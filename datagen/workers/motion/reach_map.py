@@ -17,9 +17,8 @@ from datagen.workers.geometry.mesh import F32, F64, I32
 from datagen.workers.kinematics.compiler import compiled, in_memory, struct
 from datagen.workers.kinematics.inverse import joint_poses, one_turn, tcp_pose
 from datagen.workers.kinematics.tree import Ints, KinematicTree
+from datagen.workers.motion.reach_cells import AZIMUTHS, DIRECTIONS, DISTANCES, HEIGHTS, ROLLS, SIDES
 
-DISTANCES, HEIGHTS, _SIDES, ROLLS, AZIMUTHS = 16, 32, 3, 8, 12
-DIRECTIONS = 6 * _SIDES * _SIDES  # cells on the faces of a cube
 _SAMPLES = 1 << 19  # joint vectors of a map
 _FIRST_SAMPLES = 1 << 14  # those that decide how far it extends
 _DIGITS = 6  # of an arm's numbers, in units of its length: scaled copies of an arm share samples
@@ -79,8 +78,8 @@ def cell_of(distance: float, height: float, azimuth: float, a: F64, c: F64, turn
     u, v = a[(face + 1) % 3] / largest, a[(face + 2) % 3] / largest
     if a[face] < 0:
         face += 3
-    m = min(int((u + 1) / 2 * _SIDES), _SIDES - 1)
-    n = min(int((v + 1) / 2 * _SIDES), _SIDES - 1)
+    m = min(int((u + 1) / 2 * SIDES), SIDES - 1)
+    n = min(int((v + 1) / 2 * SIDES), SIDES - 1)
     # Roll: the angle of c from the horizontal direction across a, or from y where a is steep.
     ex, ey = -a[1], a[0]
     if abs(a[2]) > 0.8:
@@ -90,7 +89,7 @@ def cell_of(distance: float, height: float, azimuth: float, a: F64, c: F64, turn
     px, py, pz = a[1] * z - a[2] * y, a[2] * x - a[0] * z, a[0] * y - a[1] * x
     roll = math.atan2(c[0] * px + c[1] * py + c[2] * pz, c[0] * x + c[1] * y + c[2] * z)
     r = min(int((roll / (2 * math.pi) + 0.5) * ROLLS), ROLLS - 1)
-    at = ((i * HEIGHTS + k) * DIRECTIONS + (face * _SIDES + m) * _SIDES + n) * ROLLS + r
+    at = ((i * HEIGHTS + k) * DIRECTIONS + (face * SIDES + m) * SIDES + n) * ROLLS + r
     if turns:
         return at
     return at * AZIMUTHS + min(int((azimuth / (2 * math.pi) + 0.5) * AZIMUTHS), AZIMUTHS - 1)

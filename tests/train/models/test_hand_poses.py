@@ -10,10 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from datagen.train.hands.poses import FARTHEST, HAND_WIDTH, N_MEASURES, DistanceGrid, hand_poses
 from datagen.train.inputs import F32, F64
 from datagen.train.models.frames import frames_of
 from datagen.train.models.hand_pooling import from_mount
-from datagen.train.models.hand_poses import FARTHEST, HAND_WIDTH, N_MEASURES, DistanceGrid, hand_poses
 
 HALF_M = np.array([0.02, 0.08, 0.05])  # a box: only across its narrow side does it fit between the fingers
 COUNT = 104

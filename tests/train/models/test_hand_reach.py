@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from datagen.schemas.errors import InputError
+from datagen.train.hands.poses import HAND_WIDTH, hand_poses
+from datagen.train.hands.reach import hand_reach
+from datagen.train.hands.sizes import FRANKA, hand_size
 from datagen.train.models import Model, build_model
-from datagen.train.models.hand_poses import HAND_WIDTH, hand_poses
-from datagen.train.models.hand_reach import hand_reach
-from datagen.train.models.hand_size import FRANKA, hand_size
 from datagen.train.models.shared import SharedModel, with_reach
 from datagen.train.tensors import on_cpu
 from datagen.train.training.checkpoints import read_checkpoint

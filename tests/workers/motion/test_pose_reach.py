@@ -5,16 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.train.models.hand_size import measured_hand
+from datagen.train.hands.sizes import measured_hand
 from datagen.workers.motion import pose_reach as module
-from datagen.workers.motion.pose_reach import (
-    known_arm,
-    measured_arm,
-    pose_reach,
-    reach_codes,
-    reaches_of,
-    size_row,
-)
+from datagen.workers.motion.measured_reach import measured_arm, reaches_of, size_row
+from datagen.workers.motion.pose_reach import known_arm, pose_reach, reach_codes
+from datagen.workers.motion.reach_cells import cells_of
+from datagen.workers.motion.reach_map import cell_of
 from datagen.workers.robots import ROBOTS as NAMES
 from datagen.workers.robots import gripper_of, open_largest, open_robot, robot_digest
 from tests.sim_extra import needs_robots, needs_sim
@@ -101,3 +97,14 @@ def test_an_arm_beyond_the_range_of_its_family_is_scaled_further() -> None:
     codes = reach_codes(pose_reach("panda-scaled", 1.0), axes, row, xy, turn, rise)
     longer = reach_codes(pose_reach("panda-scaled", 1.5), axes, row, 1.5 * xy, turn, 1.5 * rise)
     np.testing.assert_array_equal(longer[:, :, 0], codes[:, :, 0])
+
+
+@pytest.mark.parametrize("turns", [True, False])
+def test_cells_of_many_hands_are_those_of_each(turns: bool) -> None:
+    rng = np.random.default_rng(0)
+    a, c = rng.normal(size=(2, 500, 3))
+    a[:50] = np.eye(3)[rng.integers(0, 3, 50)] * rng.choice([-1, 1], (50, 1))  # borders of cells
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    azimuth = rng.uniform(-np.pi, np.pi, 500)
+    each = [cell_of(0.0, -1.0, float(t), p, q, turns) for t, p, q in zip(azimuth, a, c, strict=True)]
+    np.testing.assert_array_equal(cells_of(a.T, c.T, None if turns else azimuth), each)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from datagen.train.hands.poses import N_MEASURES
+from datagen.train.hands.sizes import HandSize, hand_size
 from datagen.train.inputs import F32, F64, I64, U8, Array, CandidateInputs, RobotInputs
-from datagen.train.models.hand_poses import N_MEASURES
-from datagen.train.models.hand_size import HandSize, hand_size
 
 # Assumed where labels or a frame name no robot: an arm of that reach with a Franka Hand.
 UNKNOWN_ROBOT = "panda-scaled"

@@ -20,8 +20,8 @@ from math import pi
 import numpy as np
 from scipy.spatial import KDTree
 
+from datagen.train.hands.sizes import FRANKA, HandSize
 from datagen.train.inputs import F32, F64, U8, Array, Bools, Ints
-from datagen.train.models.hand_size import FRANKA, HandSize
 
 _WRIST_RADIUS_M = 0.05
 _WAYS_M = (0.05, 0.1)  # back along the approach, and up

@@ -1,0 +1,162 @@
+"""From one noisy frame to a base pose: how often the arm finds a plan from there, as a table.
+
+    python -m benchmarks.frame_to_pose RUN [--scenes 100] [--checkpoint CKPT] \
+        [--houses procthor:DIR] [--objects ycb:DIR]
+
+Scenes of a run of whole grids in which some clear cell is good. Each is rendered again as the camera of its
+cloud saw it, with the noise of a stereo camera, depth in whole millimetres, and the true mask and pose.
+`predict` answers from that frame alone, from it with floor out of sight allowed, and with a map of the house:
+"lidar" has what stands in a plane 0.2 m above the floor, "full" all that stands below the arm's mount. A plan
+is then made from the very pose. "answered": there was a best pose; "good": a plan was found, of all scenes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from datagen.console.options import Sources
+from datagen.evaluation.arrival_outcomes import PLAN, Arrived, SceneTask, make_arrivals, read_outcomes
+from datagen.replaying import places_of
+from datagen.schemas.run import Run
+from datagen.schemas.shard_reading import SceneRows, read_scenes
+from datagen.schemas.specification import NoiseParams
+from datagen.train.baselines.rules import ReachShare
+from datagen.train.prediction import KnownFloor, OccupancyMap, RobotSize, load_scorer, predict, read_footprint
+from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
+from datagen.train.prediction.occupancy import FREE, OCCUPIED, UNKNOWN
+from datagen.train.prediction.predict import Prediction
+from datagen.train.scorers import Scorer
+from datagen.workers.bases.clearance import STEP_M, obstacles_of
+from datagen.workers.geometry.planar import inside_polygon
+from datagen.workers.houses.house import House
+from datagen.workers.rendering.embree import render_rays
+from datagen.workers.rendering.noise import add_noise
+from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_scene
+from datagen.workers.world import open_world
+
+_RESOLUTION_M = 0.05
+_LIDAR_M = 0.2
+_SEED = 0
+
+
+def main() -> None:
+    """Ask, plan and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("run")
+    parser.add_argument("--houses")
+    parser.add_argument("--objects")
+    parser.add_argument("--scenes", type=int, default=100)
+    parser.add_argument("--checkpoint")
+    options = parser.parse_args()
+    run = Run.open(options.run)
+    places = places_of(run, Sources(houses=options.houses, objects=options.objects))
+    world = open_world(run.manifest.spec, *places)
+    scorers: list[Scorer] = [load_scorer(options.checkpoint), ReachShare()]
+    good: dict[tuple[str, str], list[bool | None]] = {}
+    names = scorers[0].name, scorers[1].name
+    asked = 0
+    for k, stored in enumerate(read_scenes(run, range(run.n // run.layout.candidates_per_scene))):
+        clear = stored.samples["base_clearance_m"] > 0
+        if asked == options.scenes or not (stored.samples["label"][clear] == 1).any():
+            continue
+        asked += 1
+        scene = reconstruct_scene(world, stored.record)
+        frame, robot = _frame(scene, k), _robot(run, stored)
+        answers = {
+            (scorer.name, setting): predict(scorer, [frame], robot, known=known, allow_unseen=unseen)
+            for setting, known, unseen in _settings(scene.house.house, robot)
+            for scorer in scorers
+        }
+        arrived = {key: _arrived(answer, stored) for key, answer in answers.items()}
+        outcomes = _planned(run, places, k, [each for each in arrived.values() if each is not None])
+        for key, at in arrived.items():
+            good.setdefault(key, []).append(None if at is None else outcomes[at.key] == "success")
+    print(f"{asked} scenes, percent of them; intervals 95%, by resampling scenes\n")
+    print("| floor | method | answered | good |\n| --- | --- | --- | --- |")
+    for (name, setting), found in sorted(good.items(), key=lambda row: (row[0][1], names.index(row[0][0]))):
+        answered = 100 * np.mean([each is not None for each in found])
+        rate = np.array([bool(each) for each in found])
+        drawn = np.random.default_rng(_SEED).choice(rate, (2000, len(rate))).mean(axis=1)
+        low, high = 100 * np.quantile(drawn, (0.025, 0.975))
+        print(f"| {setting} | {name} | {answered:.0f} | {100 * rate.mean():.1f} [{low:.0f}, {high:.0f}] |")
+
+
+def _frame(scene: ReconstructedScene, index: int) -> SensorFrame:
+    exact = render_rays(scene.rays, scene.camera)
+    seen = add_noise(exact, NoiseParams(enabled=True), np.random.default_rng([_SEED, index]))
+    c = seen.camera
+    depth_m = (np.round(1000 * seen.depth_m) / 1000).astype(np.float32)
+    pinhole = Pinhole(c.fx_px, c.fy_px, c.cx_px - 0.5, c.cy_px - 0.5)
+    return image_frame(RgbdImage(seen.rgb, depth_m, pinhole, exact.body == 1), c.T_world_camera, {})
+
+
+def _robot(run: Run, stored: SceneRows) -> RobotSize:
+    spec, one = run.manifest.spec, {name: column[0] for name, column in stored.samples.items()}
+    assert spec.arm is not None
+    outline = spec.candidates.footprint_m
+    return RobotSize(
+        float(one["camera_height_m"]),
+        float(one["base_height_m"]),
+        float(one["arm_reach_m"]),
+        None if outline is None else read_footprint(outline),
+        0.0 if spec.candidates.yaw_rad is None else spec.candidates.yaw_rad.low,
+        spec.arm.robot,
+    )
+
+
+def _settings(house: House, robot: RobotSize) -> Iterator[tuple[str, KnownFloor | None, bool]]:
+    yield "1 frame alone", None, False
+    yield "2 unseen allowed", None, True
+    yield "3 lidar map", KnownFloor((house_map(house, _LIDAR_M, _LIDAR_M),)), False
+    yield "4 full map", KnownFloor((house_map(house, STEP_M, robot.base_height_m),)), False
+
+
+def house_map(house: House, low_m: float, high_m: float) -> OccupancyMap:
+    """The map of a house: occupied where something stands between two heights, free elsewhere in rooms."""
+    obstacles = obstacles_of(house)
+    corners = np.concatenate(obstacles.floors_m)
+    low, high = corners.min(axis=0) - 0.5, corners.max(axis=0) + 0.5
+    size = np.ceil((high - low) / _RESOLUTION_M).astype(int)
+    cells = np.full((size[1], size[0]), UNKNOWN, np.int8)
+    stands = (obstacles.low_m <= high_m) & (obstacles.high_m >= low_m)
+    for state, polygons in ((FREE, obstacles.floors_m), (OCCUPIED, obstacles.polygons_m[stands])):
+        for polygon in polygons:
+            first, last = (
+                np.floor((end - low) / _RESOLUTION_M).astype(int)
+                for end in (polygon.min(axis=0), polygon.max(axis=0))
+            )
+            column, row = np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(first, last, strict=True)))
+            xy = low + _RESOLUTION_M * (np.stack([column, row], axis=-1).reshape(-1, 2) + 0.5)
+            inside = inside_polygon(xy, polygon).reshape(column.shape)
+            cells[row[inside], column[inside]] = state
+    origin = float(low[0]), float(low[1]), 0.0
+    return OccupancyMap(house.house_id, cells, _RESOLUTION_M, origin)
+
+
+def _arrived(answer: Prediction, stored: SceneRows) -> Arrived | None:
+    """The best pose as an arrival off the candidate next to it."""
+    if answer.best is None:
+        return None
+    xy, yaw = answer.base_xy_m[answer.best], float(answer.yaw_rad[answer.best])
+    near = int(np.argmin(np.linalg.norm(stored.samples["base_xy_m"] - xy, axis=1)))
+    goal = float(stored.samples["base_yaw_rad"][near])
+    off, c, s = xy - stored.samples["base_xy_m"][near], np.cos(goal), np.sin(goal)
+    turn = (yaw - goal + np.pi) % (2 * np.pi) - np.pi
+    return Arrived(near, *(float(v) for v in (c * off[0] + s * off[1], c * off[1] - s * off[0], turn)))
+
+
+def _planned(run: Run, places: tuple[str, str, str], scene: int, arrived: list[Arrived]) -> dict[str, str]:
+    with tempfile.TemporaryDirectory() as folder:
+        spec, wanted = run.manifest.spec, tuple(sorted(set(arrived)))
+        task = SceneTask(run.storage.url, spec, *places, scene, PLAN, _SEED, folder, wanted)
+        make_arrivals(replace(task), lambda: False)
+        return read_outcomes(task.path)
+
+
+if __name__ == "__main__":
+    main()
