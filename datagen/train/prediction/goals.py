@@ -15,10 +15,12 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import whole_file
 from datagen.train.inputs import F64
 from datagen.train.prediction.predict import Prediction
-from datagen.workers.geometry.transforms import inverse
-from datagen.workers.robots import robot_source
+from datagen.workers.geometry.transforms import inverse, translation
+from datagen.workers.robots import ROBOTS, robot_source
 
 ENDINGS = (".yaml", ".mcap", ".pgm")
+# Mounts of registered robots in the frames of their bases (m), without their URDFs; (0, 0) of the others.
+MOUNTS_M = {"fetch": (0.03265, 0.0), "pr2": (-0.05, -0.188), "tiago-pro": (0.06526, 0.15918)}
 _MOST = 5
 # Alternatives differ by one of both.
 _APART_M, _APART_RAD = 0.25, math.radians(30)
@@ -44,10 +46,8 @@ def write_goal(file: Path, p: Prediction, frame_id: str, stamp_ns: int) -> bool:
         for each in goal_files(file):
             each.unlink(missing_ok=True)
         return False
-    header = {
-        "frame_id": frame_id,
-        "stamp": dict(zip(("sec", "nanosec"), divmod(stamp_ns, 10**9), strict=True)),
-    }
+    stamp = {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}
+    header: dict[str, Any] = {"frame_id": frame_id, "stamp": stamp}
     base, T_mount_base = _base(p)
     match file.suffix:
         case ".yaml":
@@ -73,13 +73,15 @@ def alternatives(p: Prediction) -> list[int]:
 
 def _base(p: Prediction) -> tuple[str, F64]:
     """The frame of the robot's base, and its pose (4, 4) in the frame of the arm's mount."""
-    if not p.robot.name:
+    if not (name := p.robot.name):
         return "base_link", np.eye(4)
+    base = robot_source(name).keys.arm.base
+    if name in ROBOTS:
+        return base, inverse(translation(*MOUNTS_M.get(name, (0.0, 0.0)), 0.0))
     # Imported here: reads the robot's URDF.
     from datagen.workers.robots.assembly import assemble
 
-    source = robot_source(p.robot.name)
-    return source.keys.arm.base, inverse(assemble(source, None).T_root_mount)
+    return base, inverse(assemble(robot_source(name), None).T_root_mount)
 
 
 def _pose(p: Prediction, row: int, T_mount_base: F64) -> dict[str, dict[str, float]]:
@@ -98,16 +100,9 @@ def _document(p: Prediction, header: dict[str, Any], base: str, T_mount_base: F6
         return {"pose": _pose(p, row, T_mount_base)} | level
 
     assert p.best is not None
-    best = scored(p.best)
-    goal = {"header": header, "pose": best.pop("pose")}
-    others = [scored(row) for row in alternatives(p)]
-    return {
-        "goal": goal,
-        "child_frame_id": base,
-        **best,
-        "may_miss_m": p.choice.miss_m,
-        "alternatives": others,
-    }
+    best, others = scored(p.best), [scored(row) for row in alternatives(p)]
+    goal = {"goal": {"header": header, "pose": best.pop("pose")}, "child_frame_id": base}
+    return {**goal, **best, "may_miss_m": p.choice.miss_m, "alternatives": others}
 
 
 def _write_text(file: Path, document: dict[str, Any]) -> None:

@@ -156,24 +156,15 @@ class Prediction:
         """Codes and texts of what speaks against one base pose; how far it may be missed only of the best."""
         score, expected = self.score[row], self.choice.expected
         miss_m = self.choice.miss_m if row == self.best else None
+        is_unseen = self.cells.state[row] == STATES.index(UNSEEN)
+        is_tight = expected is None and miss_m is not None and miss_m < _LEAST_MISS_M
+        fails = expected is not None and expected[row] < _LIKELY
         few = self.target_points < _CROP.min_target_points
         doubts = (
             ("medium_score", f"a medium score, {score:.3f}", score < _SURE),
-            (
-                "floor_not_visible",
-                "the floor there or on the way is not visible",
-                self.cells.state[row] == STATES.index(UNSEEN),
-            ),
-            (
-                "small_tolerance",
-                f"scores stay good only within {miss_m or 0.0:.2f} m of it",
-                expected is None and miss_m is not None and miss_m < _LEAST_MISS_M,
-            ),
-            (
-                "failure_likely",
-                "with the arrival error, failure is likelier than success",
-                expected is not None and expected[row] < _LIKELY,
-            ),
+            ("floor_not_visible", "the floor there or on the way is not visible", is_unseen),
+            ("small_tolerance", f"scores stay good only within {miss_m or 0.0:.2f} m of it", is_tight),
+            ("failure_likely", "with the arrival error, failure is likelier than success", fails),
             ("floor_uncertain", "the floor is uncertain", any(g.doubt is not None for g in self.grounds)),
             ("few_target_points", "few points of the target", few),
             ("few_surroundings", "few surroundings were observed", self.crop_seen < _LEAST_SEEN),

@@ -15,13 +15,16 @@ from mcap_ros2.decoder import DecoderFactory
 from PIL import Image
 from rosbags.rosbag2 import Reader
 
+import datagen.workers.robots
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array, Batch
 from datagen.train.prediction import KnownFloor, RobotSize, predict
 from datagen.train.prediction.base_cells import STATES
-from datagen.train.prediction.goals import alternatives, write_goal
+from datagen.train.prediction.goals import MOUNTS_M, alternatives, write_goal
 from datagen.train.prediction.predict import Prediction
-from tests.sim_extra import needs_sim
+from datagen.workers.geometry.transforms import yaw_pose
+from datagen.workers.robots import robot_source
+from tests.sim_extra import named_robots, needs_sim
 from tests.train.prediction.recorded_scenes import STORE
 from tests.train.prediction.seen_scenes import Seen, sensor_frame
 from tests.train.prediction.test_occupancy import FREE, mapped
@@ -145,16 +148,39 @@ def test_scores_as_a_map_of_nav2(answer: Prediction, tmp_path: Path) -> None:
     assert_costs(answer, cells, np.array(described["origin"][:2]), described["resolution"])
 
 
-@needs_sim
 def test_the_base_of_a_robot_is_not_its_mount(answer: Prediction, tmp_path: Path) -> None:
-    named = replace(answer, robot=replace(answer.robot, name="fetch"))
+    named = replace(answer, robot=replace(answer.robot, name="pr2"))
     goal = written(tmp_path / "goal.yaml", named)
     x, y, yaw = pose_of(goal["goal"]["pose"])
-    assert named.best is not None and goal["child_frame_id"] == "base_link"
-    # The first joint of Fetch's arm lies that far ahead of its base_link.
-    ahead = 0.03265 * np.array([math.cos(yaw), math.sin(yaw)])
-    np.testing.assert_allclose(np.array([x, y]) + ahead, named.base_xy_m[named.best], atol=1e-4)
+    assert named.best is not None and goal["child_frame_id"] == "base_footprint"
+    # PR2's arm is mounted 5 cm behind and 18.8 cm to the right of the middle of its base.
+    mount = yaw_pose(x, y, 0.0, yaw) @ [-0.05, -0.188, 0.0, 1.0]
+    np.testing.assert_allclose(mount[:2], named.base_xy_m[named.best], atol=1e-9)
     assert yaw == pytest.approx(named.yaw_rad[named.best])
+
+
+@needs_sim
+@pytest.mark.parametrize("name", named_robots())
+def test_mounts_are_those_of_the_urdfs(name: str) -> None:
+    from datagen.workers.robots.assembly import assemble
+
+    T = assemble(robot_source(name), None).T_root_mount
+    np.testing.assert_allclose(T[:3, :3], np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(T[:2, 3], MOUNTS_M.get(name, (0.0, 0.0)), atol=1e-4)
+
+
+@needs_sim
+def test_the_mount_of_an_own_robot_is_read_from_its_urdf(answer: Prediction, tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text((Path(datagen.workers.robots.__file__).parent / "fetch.toml").read_text())
+    goals = [
+        written(tmp_path / "goal.yaml", replace(answer, robot=replace(answer.robot, name=name)))
+        for name in ("fetch", str(own))
+    ]
+    fetch, copied = (pose_of(goal["goal"]["pose"]) for goal in goals)
+    assert fetch == pytest.approx(copied, abs=1e-4) and fetch[:2] != pytest.approx(
+        row_pose(answer, answer.best or 0)[:2], abs=0.01
+    )
 
 
 def test_no_good_pose_leaves_no_goal(answer: Prediction, tmp_path: Path) -> None:
