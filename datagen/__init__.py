@@ -13,6 +13,7 @@ __version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from datagen.commands.evaluate import evaluate
+    from datagen.commands.find_base import find_base
     from datagen.commands.merge import merge
     from datagen.commands.predict import predict
     from datagen.commands.resume import resume
@@ -39,6 +40,7 @@ __all__ = [
     "__version__",
     "candidates",
     "evaluate",
+    "find_base",
     "houses",
     "label_sources",
     "load_scorer",
@@ -55,6 +57,7 @@ __all__ = [
 
 _MODULES = {
     "datagen.commands.evaluate": ("evaluate",),
+    "datagen.commands.find_base": ("find_base",),
     "datagen.commands.merge": ("merge",),
     "datagen.commands.predict": ("predict",),
     "datagen.commands.resume": ("resume",),

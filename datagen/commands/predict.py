@@ -120,7 +120,7 @@ class PredictOptions:
         map: Map of the floor, map.yaml as Nav2 has it, in which the frames have their poses; repeatable.
         keep_out: Map of which no base may stand on occupied cells, FILE.yaml.
         arrival: Arrival error to choose for: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv.
-        out: Picture to write, FILE.png.
+        out: Picture to write, FILE.png, .pdf or .svg.
         html: Page to write, FILE.html.
         goal: Goal for the robot's base to write, FILE.yaml or .mcap; FILE.pgm: the scores as a map.
     """
@@ -267,7 +267,7 @@ def predict(given: PredictOptions) -> Prediction:
         from datagen.train.prediction.pictures import draw_prediction
 
         with whole_file(out, alone=True) as file:
-            draw_prediction(answer, file)
+            draw_prediction(answer, file, out.suffix.lower())
     if html is not None:
         from datagen.train.prediction.page import page_of
 
@@ -322,8 +322,8 @@ def _refuse_outputs(out: Path | None, html: Path | None, goal: Path | None, read
     paths = [Path(each) for each in read if isinstance(each, (str, Path))]
     taken = {each.resolve() for path in paths for each in (path, *(path / n for n in (RGB, DEPTH, MASK)))}
     for option, file, endings in (
-        ("--out", out, [".png"]),
-        ("--html", html, [".html"]),
+        ("--out", out, (".png", ".pdf", ".svg")),
+        ("--html", html, (".html",)),
         ("--goal", goal, ENDINGS),
     ):
         if file is None:

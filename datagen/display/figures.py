@@ -32,8 +32,13 @@ def new_sheet(title: str, height_in: float) -> Figure:
     return figure
 
 
-def save_sheet(figure: Figure, out: Path | IO[bytes]) -> None:
-    """Write the figure as a true-colour PNG, as small as it gets without loss."""
+def save_sheet(figure: Figure, out: Path | IO[bytes], ending: str = ".png") -> None:
+    """Write the figure as a true-colour PNG, as small as it gets without loss, or as .pdf or .svg."""
+    if ending != ".png":
+        figure.savefig(
+            out, format=ending[1:], metadata={"Date" if ending == ".svg" else "CreationDate": None}
+        )
+        return
     with io.BytesIO() as drawn:
         figure.savefig(drawn, format="raw")
         sheet = Image.frombuffer("RGBA", figure.canvas.get_width_height(), drawn.getvalue())

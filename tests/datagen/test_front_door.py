@@ -25,7 +25,7 @@ from datagen.sources import Registry
 from tests.small_runs import CONFIG, make_small_run
 from tests.train.conftest import sim_run
 from tests.train.prediction.checkpoints import write_untrained
-from tests.train.prediction.seen_scenes import MODEL, draw_seen, write_frame
+from tests.train.prediction.seen_scenes import MODEL, camera_arrays, draw_seen, write_frame
 
 __all__ = ["sim_run"]
 
@@ -90,9 +90,10 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     other = make_small_run(folder / "other", 16, "--seed", "1")
     checkpoint = folder / "untrained.ckpt"
     write_untrained(checkpoint, MODEL)
-    frame = write_frame(folder / "frame", draw_seen(0))
+    seen = draw_seen(0)
+    frame = write_frame(folder / "frame", seen)
     names = {"folder": folder, "run": run, "other": other, "checkpoint": checkpoint, "frame": frame}
-    return {"datagen": datagen, "torch": torch, **names}
+    return {"datagen": datagen, "torch": torch, **names, "camera": camera_arrays(seen)}
 
 
 @pytest.mark.parametrize("name", [*FUNCTIONS, "Registry"])

@@ -37,8 +37,8 @@ _NEAREST_M = 0.05  # before a camera; nearer points are not in its picture
 _MAP_COLOURS = ("#e8eef4", "#4a4a4a")  # of free and of occupied floor
 
 
-def draw_prediction(prediction: Prediction, out: IO[bytes]) -> None:
-    """Write the picture as PNG: frame and answer on the left, the plan on the right."""
+def draw_prediction(prediction: Prediction, out: IO[bytes], ending: str = ".png") -> None:
+    """Write the picture, .png, .pdf or .svg: frame and answer on the left, the plan on the right."""
     said = "; ".join((prediction.level, *prediction.reasons))
     title = textwrap.fill(f"Base poses scored by {prediction.scorer}: {said}", 80)
     figure = new_sheet(title, 7.0)
@@ -56,7 +56,7 @@ def draw_prediction(prediction: Prediction, out: IO[bytes]) -> None:
     scale = ScalarMappable(Normalize(0, 1), SCORE_COLOURS)
     right.colorbar(scale, ax=plan, shrink=0.75, label="score (0 bad, 1 good)")
     _draw_plan(plan, prediction, scale)
-    save_sheet(figure, out)
+    save_sheet(figure, out, ending)
 
 
 def _draw_base(axes: Axes, prediction: Prediction, image: RgbdImage, T_world_camera: F64) -> None:

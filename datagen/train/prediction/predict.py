@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 from typing import Literal
 
@@ -49,7 +50,7 @@ _SURE, _LIKELY = 0.8, 0.5
 _LEAST_MISS_M, _LEAST_SEEN = 0.03, 0.1
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Prediction:
     """A scored grid of base poses around the target, with its explanation. World: floor z = 0."""
 
@@ -69,6 +70,21 @@ class Prediction:
     # Codes and texts about the robot: its sizes, and whether its hand can hold the target.
     doubts: tuple[tuple[str, str], ...]
     notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        if self.best is None:
+            return f"Prediction(none: {'; '.join(self.reasons)})"
+        x, y = self.base_xy_m[self.best]
+        pose = f"x {x:.3f} m, y {y:.3f} m, yaw {math.degrees(self.yaw_rad[self.best]):.1f} deg"
+        return f"Prediction({self.level}: {pose}, score {self.score[self.best]:.3f})"
+
+    def _repr_png_(self) -> bytes:
+        """What notebooks show: the picture of `datagen predict --out`."""
+        from datagen.train.prediction.pictures import draw_prediction
+
+        with BytesIO() as drawn:
+            draw_prediction(self, drawn)
+            return drawn.getvalue()
 
     @property
     def best(self) -> int | None:

@@ -76,6 +76,14 @@ def sensor_frame(
     return image_frame(image, pose if posed else None, {})
 
 
+def camera_arrays(seen: Seen) -> tuple[np.ndarray, ...]:
+    """rgb, depth in millimetres, K, T_map_camera and mask, as a driver has them."""
+    c = seen.frame.camera
+    K = np.array([[c.fx_px, 0, c.cx_px - 0.5], [0, c.fy_px, c.cy_px - 0.5], [0, 0, 1]])
+    depth = np.round(seen.frame.depth_m * 1000).astype(np.uint16)
+    return seen.frame.rgb, depth, K, c.T_world_camera, seen.frame.body == 1
+
+
 def write_frame(folder: Path, seen: Seen, *, posed: bool = True, mask: bool = True) -> Path:
     """The folder with the files of the frame."""
     folder.mkdir()
