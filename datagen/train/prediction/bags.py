@@ -26,7 +26,7 @@ DAMAGED = (
     *(AssertionError, EOFError, LookupError, MemoryError, OSError, RuntimeError, SyntaxError, TypeError),
     ValueError,
 )
-FIX = "Name an .mcap file, a .db3 file or a folder of rosbag2 that `ros2 bag info` reads"
+FIX = "Name an .mcap, .db3 or folder that `ros2 bag info` reads; `mcap recover` repairs a file that was cut"
 OTHER_FRAME = "Choose another frame with --at, or record it again"
 _ENDINGS = (".mcap", ".db3")
 _ZSTD = b"\x28\xb5\x2f\xfd"
