@@ -49,6 +49,7 @@ def print_prediction(
     out: str | Path | None = None,
     html: str | Path | None = None,
     demo: bool = False,
+    goal: str | Path | None = None,
     **_: Any,
 ) -> int:
     """Print the best base pose; the exit code is 1 where no clear one has a good score."""
@@ -59,7 +60,10 @@ def print_prediction(
     else:
         if demo:
             out, html = out or DEMO_PICTURE, html or _demo_page()
-        written = [(name, str(file)) for name, file in (("picture", out), ("page", html)) if file is not None]
+        files = ("picture", out), ("page", html), ("goal", goal)
+        written = [(name, str(file)) for name, file in files if file is not None]
+        if goal is not None and prediction.best is None:
+            written[-1] = ("goal", f"none: {goal} is not written")
         print_rows(f"base poses by {prediction.scorer}", [*report_rows(prediction), *written])
     return 0 if prediction.best is not None else 1
 
@@ -101,6 +105,10 @@ class PredictOptions:
         reach: Reach of the arm from its mount (m).
         demo: Predict on the frame that ships with the package; writes demo.png and demo.html.
         frame: Frame as a folder, .npz, .ply or .pcd; several with poses are fused.
+        bag: Recording of ROS 2 in place of frames: .mcap, .db3 or a folder of rosbag2, with tf.
+        at: Seconds from the start of the recording to its frame; several frames are fused.
+            [default: the last frame]
+        topic: Topic of the recording, where several fit: color, depth, color_info, depth_info or map=TOPIC.
         click: Pixel u,v on the target in the first frame, where it has no mask.
         camera_height: Height of the frame's camera (m), where it has no pose.
         gravity: Direction of gravity x,y,z in the camera frame (x right, y down).
@@ -115,6 +123,7 @@ class PredictOptions:
         arrival: Arrival error to choose for: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv.
         out: Picture to write, FILE.png, .pdf or .svg.
         html: Page to write, FILE.html.
+        goal: Goal for the robot's base to write, FILE.yaml or .mcap; FILE.pgm: the scores as a map.
     """
 
     checkpoint: Annotated[Checkpoint | None, Parameter(name="CHECKPOINT")] = None
@@ -124,6 +133,9 @@ class PredictOptions:
     reach: float | None = None
     demo: bool = False
     frame: Frames | None = None
+    bag: File | None = None
+    at: Sequence[float] = ()
+    topic: Sequence[str] = ()
     click: Annotated[tuple[int, int] | None, Parameter(converter=_pixel, n_tokens=1, metavar="STR")] = None
     camera_height: float | None = None
     gravity: Annotated[
@@ -139,13 +151,18 @@ class PredictOptions:
     arrival: str | None = None
     out: File | None = None
     html: File | None = None
+    goal: File | None = None
     json: AsJson = False
 
     def __post_init__(self) -> None:
         """Raise InputError for options that are out of range or do not go together."""
-        if self.demo and not (self.frame is self.click is None):
+        if self.demo and not (self.frame is self.click is self.bag is None):
             fix = "Omit --demo to predict on a frame of your own"
             raise InputError("--demo", "", "has a frame and a click of its own", fix)
+        if self.bag is not None and self.frame is not None:
+            raise InputError("--bag", "", "is given with --frame", "Give one of them")
+        if self.bag is None and (self.at or self.topic):
+            raise InputError("--at" if self.at else "--topic", "", "is for --bag", "Name the recording")
         for name in ("base_height", "reach", "camera_height", "robot_camera_height"):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and 0 < value <= _LARGEST_M):
@@ -219,16 +236,24 @@ def predict(given: PredictOptions) -> Prediction:
     outline = None if given.footprint is None else read_footprint(given.footprint)
     error = None if given.arrival is None else read_arrival(given.arrival)
     direction = None if given.gravity is None else _direction(given.gravity)
-    out, html = (None if file is None else Path(file) for file in (given.out, given.html))
-    named = [Path(each) if isinstance(each, str) else each for each in _required(given.frame, "--frame")]
-    _refuse_outputs(out, html, named)
-    frames = [read_place(each, given.depth_scale) if isinstance(each, Path) else each for each in named]
+    out, html, goal = (None if file is None else Path(file) for file in (given.out, given.html, given.goal))
+    named, recorded, known = given.frame or (), None, given.map
+    _refuse_outputs(out, html, goal, [*named, given.bag, *given.map, *given.keep_out])
+    if given.bag is not None:
+        from datagen.train.prediction.recordings import read_recording
+
+        recorded = read_recording(Path(given.bag), given.at, given.topic)
+        named, known = recorded.frames, given.map or [each for each in [recorded.map] if each is not None]
+    frames = [
+        read_place(each, given.depth_scale) if isinstance(each, (str, Path)) else each
+        for each in _required(named or None, "--frame")
+    ]
     own_height = given.robot_camera_height or given.camera_height
     if own_height is None and frames and (pose := frames[0].T_world_camera) is not None:
         own_height = float(pose[2, 3])
     maps, keep_out = (
         tuple(read_map(Path(each)) if isinstance(each, (str, Path)) else each for each in given_maps)
-        for given_maps in (given.map, given.keep_out)
+        for given_maps in (known, given.keep_out)
     )
     scorer = given.checkpoint
     answer = scored(
@@ -252,6 +277,10 @@ def predict(given: PredictOptions) -> Prediction:
 
         with whole_file(html, alone=True) as file:
             file.write(page_of(answer).encode())
+    if goal is not None:
+        from datagen.train.prediction.goals import write_goal
+
+        write_goal(goal, answer, *(("map", 0) if recorded is None else (recorded.world, recorded.stamp_ns)))
     return answer
 
 
@@ -271,7 +300,7 @@ def _of_robot(given: PredictOptions, robot: str) -> tuple[PredictOptions, float]
 
 def _required(value: T | None, option: str) -> T:
     if value is None:
-        fix = "Name a frame" if option == "--frame" else "Give it in metres"
+        fix = "Name a frame, or a recording with --bag" if option == "--frame" else "Give it in metres"
         raise InputError("datagen predict", option, "is missing", fix)
     return value
 
@@ -285,18 +314,27 @@ def _direction(given: Sequence[float]) -> F64:
     return values
 
 
-def _refuse_outputs(out: Path | None, html: Path | None, frames: Sequence[Any]) -> None:
-    """Raise InputError for an output that is a folder or a picture of a frame."""
+def _refuse_outputs(out: Path | None, html: Path | None, goal: Path | None, read: Sequence[Any]) -> None:
+    """Raise InputError for an output that is a folder or is among the files to `read`."""
     from datagen.train.prediction.frames import frame_files
+    from datagen.train.prediction.goals import ENDINGS, goal_files
 
     if html is not None:
         import_module("datagen.train.prediction.page")  # reports a missing library before scoring
-    folders = [path for path in frames if isinstance(path, Path) and path.is_dir()]
-    read = {file.resolve() for folder in folders for file in frame_files(folder).values()}
-    for option, file, endings in (("--out", out, (".png", ".pdf", ".svg")), ("--html", html, (".html",))):
+    if goal is not None and goal.suffix == ".mcap":
+        import_module("rosbags")
+    paths = [Path(each) for each in read if isinstance(each, (str, Path))]
+    of_folders = [file for path in paths if path.is_dir() for file in frame_files(path).values()]
+    taken = {each.resolve() for each in (*paths, *of_folders)}
+    for option, file, endings in (
+        ("--out", out, (".png", ".pdf", ".svg")),
+        ("--html", html, (".html",)),
+        ("--goal", goal, ENDINGS),
+    ):
         if file is None:
             continue
         refuse_output(file, option, *endings)
-        if file.is_dir() or file.resolve() in read:
-            problem = "is a folder" if file.is_dir() else "is a picture of the frame"
-            raise InputError(file, option, problem, "Give another name")
+        for each in goal_files(file):
+            if each.is_dir() or each.resolve() in taken:
+                problem = "is a folder" if each.is_dir() else "is a file of the input"
+                raise InputError(each, option, problem, "Give another name")

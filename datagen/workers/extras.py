@@ -69,6 +69,7 @@ EXTRAS: dict[str, Extra] = {
             **_PICTURES,
         },
     ),
+    "ros": Extra("predict from recordings of ROS 2, goals as MCAP", {"rosbags": "rosbags"}),
     "cluster": Extra("workers of Ray: several processes, several machines", {"ray": "ray"}),
     "tables": Extra(
         "open_dataset and candidates: xarray and pandas", {"pandas": "pandas", "xarray": "xarray"}

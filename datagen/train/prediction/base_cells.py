@@ -195,6 +195,8 @@ class Choice:
     nominal: int | None  # the row with the best score
     expected: F64 | None  # (N,) success expected with the arrival error; None without one
     miss_m: float | None  # distance by which the robot may miss the best while scores stay good
+    can_stand: Bools  # (N,) whether a pose may be chosen
+    ranked: I64  # (K,) rows of those with a good score, best first
 
 
 def choose(
@@ -208,15 +210,16 @@ def choose(
     can_stand = np.isin(cells.state, [STATES.index(name) for name in allowed])
     rows = np.flatnonzero(can_stand)
     if not len(rows):
-        return Choice(None, None, None, None)
+        return Choice(None, None, None, None, can_stand, rows)
     nominal = int(rows[np.argmax(score[rows])])
     if score[nominal] < threshold:
-        return Choice(None, nominal, None, None)
+        return Choice(None, nominal, None, None, can_stand, rows[:0])
     side = round(float(np.sqrt(len(score))))
     step_m = float(np.ptp(cells.offset_m[:, 0]) / (side - 1))
     value = stands(score, can_stand).reshape(side, side)
     expected = None if arrival is None else expected_success(value, step_m, arrival).ravel()
+    good = rows[~(score[rows] < threshold)]
+    ranked = good[np.argsort(-(score if expected is None else expected)[good], kind="stable")]
     best = nominal if expected is None else int(rows[np.argmax(expected[rows])])
-    if np.isnan(threshold):
-        return Choice(best, nominal, expected, None)
-    return Choice(best, nominal, expected, tolerance_m(value, step_m, divmod(best, side), threshold))
+    miss_m = None if np.isnan(threshold) else tolerance_m(value, step_m, divmod(best, side), threshold)
+    return Choice(best, nominal, expected, miss_m, can_stand, ranked)

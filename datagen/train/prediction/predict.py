@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from io import BytesIO
 from pathlib import Path
 from typing import Literal
@@ -66,7 +67,8 @@ class Prediction:
     choice: Choice
     arrival: Arrival | None
     known: KnownFloor | None
-    doubts: tuple[str, ...]  # about the robot: its sizes, and whether its hand can hold the target
+    # Codes and texts about the robot: its sizes, and whether its hand can hold the target.
+    doubts: tuple[tuple[str, str], ...]
     notes: tuple[str, ...]
 
     def __repr__(self) -> str:
@@ -126,7 +128,7 @@ class Prediction:
         rows = self.rows(STATES[int(self.cells.state[self.best])])
         return float(self.score[self.best] - self.score[rows[_RANK - 1]]) if len(rows) >= _RANK else None
 
-    @property
+    @cached_property
     def crop_seen(self) -> float:
         """Share of the floor plan around the target in which anything was measured."""
         return seen_share(self.cloud.points_m[: self.cloud.n].astype(np.float32), _CROP.crop_radius_m)
@@ -150,29 +152,40 @@ class Prediction:
     @property
     def reasons(self) -> tuple[str, ...]:
         """Why the answer is no better than it is; empty for a good one."""
+        return tuple(text for _, text in self.coded_reasons)
+
+    @property
+    def coded_reasons(self) -> tuple[tuple[str, str], ...]:
+        """The reasons, each with a short code for programs."""
+        if self.best is not None:
+            return self.doubts_about(self.best)
         nominal, unseen = self.choice.nominal, self.rows(UNSEEN)
-        if self.best is None:
-            reasons = ["no clear base pose was observed around the target"]
-            if nominal is not None:
-                reasons = [f"the highest score of a clear base pose is only {self.score[nominal]:.3f}"]
-            if len(unseen) and (nominal is None or self.score[unseen[0]] >= _LIKELY):
-                reasons.append("unseen ones are left: show their floor in more frames")
-            return tuple(reasons)
-        score, expected, miss_m = self.score[self.best], self.choice.expected, self.choice.miss_m
-        doubts = {
-            f"a medium score, {score:.3f}": score < _SURE,
-            "the floor there or on the way is not visible": self.cells.state[self.best]
-            == STATES.index(UNSEEN),
-            f"scores stay good only within {miss_m or 0.0:.2f} m of it": expected is None
-            and miss_m is not None
-            and miss_m < _LEAST_MISS_M,
-            "with the arrival error, failure is likelier than success": expected is not None
-            and expected[self.best] < _LIKELY,
-            "the floor is uncertain": any(ground.doubt is not None for ground in self.grounds),
-            "few points of the target": self.target_points < _CROP.min_target_points,
-            "few surroundings were observed": self.crop_seen < _LEAST_SEEN,
-        }
-        return (*(reason for reason, holds in doubts.items() if holds), *self.doubts)
+        reasons = [("no_clear_pose", "no clear base pose was observed around the target")]
+        if nominal is not None:
+            text = f"the highest score of a clear base pose is only {self.score[nominal]:.3f}"
+            reasons = [("low_score", text)]
+        if len(unseen) and (nominal is None or self.score[unseen[0]] >= _LIKELY):
+            reasons.append(("unseen_left", "unseen ones are left: show their floor in more frames"))
+        return tuple(reasons)
+
+    def doubts_about(self, row: int) -> tuple[tuple[str, str], ...]:
+        """Codes and texts of what speaks against one base pose; how far it may be missed only of the best."""
+        score, expected = self.score[row], self.choice.expected
+        miss_m = self.choice.miss_m if row == self.best else None
+        is_unseen = self.cells.state[row] == STATES.index(UNSEEN)
+        is_tight = expected is None and miss_m is not None and miss_m < _LEAST_MISS_M
+        fails = expected is not None and expected[row] < _LIKELY
+        few = self.target_points < _CROP.min_target_points
+        doubts = (
+            ("medium_score", f"a medium score, {score:.3f}", score < _SURE),
+            ("floor_not_visible", "the floor there or on the way is not visible", is_unseen),
+            ("small_tolerance", f"scores stay good only within {miss_m or 0.0:.2f} m of it", is_tight),
+            ("failure_likely", "with the arrival error, failure is likelier than success", fails),
+            ("floor_uncertain", "the floor is uncertain", any(g.doubt is not None for g in self.grounds)),
+            ("few_target_points", "few points of the target", few),
+            ("few_surroundings", "few surroundings were observed", self.crop_seen < _LEAST_SEEN),
+        )
+        return (*((code, text) for code, text, holds in doubts if holds), *self.doubts)
 
 
 _CROP = ObservationParams()
@@ -261,12 +274,13 @@ def predict(
     choice = choose(score, cells, allowed, scorer.threshold, seen_from_goal)
     read = (note for frame in frames if frame.image is not None for note in frame.image.notes)
     notes = (*read, *_notes(grounds, filled, cloud))
-    doubts = (*robot_notes(scorer, robot), *_hand_doubts(target, robot))
+    sizes = (("untrained_size", note) for note in robot_notes(scorer, robot))
+    doubts = (*sizes, *_hand_doubts(target, robot))
     given = (scorer.name, robot, tuple(frames), tuple(grounds), seen, target, filled, cloud, cells)
     return Prediction(*given, score, choice, arrival, known, doubts, notes)
 
 
-def _hand_doubts(target: TargetBox, robot: RobotSize) -> tuple[str, ...]:
+def _hand_doubts(target: TargetBox, robot: RobotSize) -> tuple[tuple[str, str], ...]:
     from datagen.train.hands.reach import UNKNOWN_ROBOT
     from datagen.train.hands.sizes import hand_size
 
@@ -276,7 +290,7 @@ def _hand_doubts(target: TargetBox, robot: RobotSize) -> tuple[str, ...]:
     size = (
         f"all sides of the target are at least {target.narrowest_m:.2f} m, and the hand opens {opens_m:.2f} m"
     )
-    return (f"{size}: only a rim or a handle could be held",)
+    return (("target_too_wide", f"{size}: only a rim or a handle could be held"),)
 
 
 def _grounds(

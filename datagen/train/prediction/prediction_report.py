@@ -66,6 +66,7 @@ def document(prediction: Prediction) -> dict[str, Any]:
         "scorer": p.scorer,
         "level": p.level,
         "reasons": list(p.reasons),
+        "reason_codes": [code for code, _ in p.coded_reasons],
         "notes": list(p.notes),
         "world": _world_axes(p),
         "best": None if p.best is None else _pose(p, p.best),

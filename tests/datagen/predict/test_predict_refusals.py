@@ -178,7 +178,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("--frame", "{bad}/zero.npz", "not a file"),
     ("--out", "{bad}/a.jpg", ".png"),
     ("--out", "{bad}/missing/a.png", "folder"),
-    ("--out", "{made}/frame/color.png", "picture of the frame"),
+    ("--out", "{made}/frame/color.png", "file of the input"),
     ("--html", "{bad}/a.png", ".html"),
 ]
 
