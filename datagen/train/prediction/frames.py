@@ -25,7 +25,7 @@ from datagen.train.prediction.files import (
     read_rgb,
     scaled_depth,
 )
-from datagen.train.prediction.intrinsics import Pinhole, read_intrinsics
+from datagen.train.prediction.intrinsics import Intrinsics, Pinhole, read_intrinsics
 from datagen.train.prediction.pcd import read_pcd
 from datagen.train.prediction.ply import read_ply
 
@@ -59,12 +59,16 @@ class RgbdImage:
         v, u = np.divmod(pixels, self.depth_m.shape[1])
         return self.pinhole.points(u, v, (self.depth_m if depth_m is None else depth_m).ravel()[pixels])
 
-    def undistorted(self, source: I64) -> RgbdImage:
-        """The picture of an ideal pinhole; `source` as above. Depth is the nearest pixel's, never a mean."""
+    def undistorted(self, camera: Intrinsics) -> RgbdImage:
+        """The picture of an ideal pinhole, noted. Depth is the nearest pixel's, never a mean."""
+        if (source := camera.source_pixels(*self.depth_m.shape)) is None:
+            return self
+        note = f"lens distortion ({camera.model or 'Brown-Conrady'}) was undone"
         inside, flat = source >= 0, np.maximum(source, 0)
         rgb = self.rgb.reshape(-1, 3)[flat] * inside[..., None]
         mask = None if self.mask is None else self.mask.ravel()[flat] & inside
-        return replace(self, rgb=rgb, depth_m=self.depth_m.ravel()[flat] * inside, mask=mask, source=source)
+        depth_m, notes = self.depth_m.ravel()[flat] * inside, (*self.notes, note)
+        return replace(self, rgb=rgb, depth_m=depth_m, mask=mask, source=source, notes=notes)
 
     def pixel_of(self, u: int, v: int) -> tuple[int, int]:
         """Where pixel (u, v) of the picture that was given lies in this one."""
@@ -142,12 +146,8 @@ def read_frame(
     depth_m, step_m, notes = scaled_depth(stored, depth_scale, depth)
     image = RgbdImage(colour, depth_m, camera.pinhole, chosen, step_m=step_m, notes=notes)
     sources = {"rgb": str(rgb), "depth": str(depth), "mask": str(mask)}
-    frame = image_frame(image, T, sources)
-    if (source := camera.source_pixels(height, width)) is None:
-        return frame
-    note = f"lens distortion ({camera.model or 'Brown-Conrady'}) was undone"
-    image = replace(image.undistorted(source), notes=(*image.notes, note))
-    return image_frame(image, T, sources)
+    image_frame(image, T, sources)  # refuses images that do not fit
+    return image_frame(image.undistorted(camera), T, sources)
 
 
 def read_place(place: str | Path, depth_scale: float | None = None) -> SensorFrame:

@@ -11,7 +11,7 @@ import struct
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -23,7 +23,8 @@ from datagen.schemas.errors import InputError
 from datagen.train.inputs import F32, F64, U8
 from datagen.train.prediction.bags import DAMAGED, FIX, OTHER_FRAME, Bag, stamp_ns, windows
 from datagen.train.prediction.files import MAX_PIXELS, MAX_SIDE_PX, checked_pose, valid_depth
-from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame, moved
+from datagen.train.prediction.frames import RgbdImage, SensorFrame, image_frame, moved
+from datagen.train.prediction.intrinsics import Intrinsics, Pinhole
 from datagen.train.prediction.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyMap
 from datagen.train.prediction.transform_tree import NoTransformError, TransformTree
 from datagen.workers.geometry.transforms import inverse, pose
@@ -169,46 +170,49 @@ def _frame(
     world = next((name for name in ("map", "odom") if name in poses), [*poses][-1])
     rgb, depth_m = _rgb(bag, names[0], messages[0]), _depth(bag, names[1], messages[1])
     by, camera = (
-        _pinhole(bag, topics, *each) for each in (("color", rgb, color[1]), ("depth", depth_m, depth[1]))
+        _camera(bag, topics, *each) for each in (("color", rgb, color[1]), ("depth", depth_m, depth[1]))
     )
-    if seen != painted or rgb.shape[:2] != depth_m.shape or by != camera:
+    is_aligned = seen == painted and rgb.shape[:2] == depth_m.shape and by.pinhole == camera.pinhole
+    grey = rgb if is_aligned else np.zeros((*depth_m.shape, 3), np.uint8)
+    image = RgbdImage(grey, depth_m, camera.pinhole, None).undistorted(camera)
+    if not is_aligned:
         others = {seen: np.eye(4)} if seen == painted else tree.poses(painted, depth[0])
         if (common := next((name for name in poses if name in others), None)) is None:
             raise tree.lacks(f"from {painted} to {seen}")
-        rgb = _painted(depth_m, camera, rgb, by, inverse(others[common]) @ poses[common])
+        picture = RgbdImage(rgb, np.zeros(rgb.shape[:2], np.float32), by.pinhole, None).undistorted(by)
+        image = replace(image, rgb=_painted(image, picture, inverse(others[common]) @ poses[common]))
     place = f"{bag.path}: {names[1]}"
     T = checked_pose(poses[world], place)
-    return image_frame(RgbdImage(rgb, depth_m, camera, None), T, {"depth": place}), world
+    return image_frame(image, T, {"depth": place}), world
 
 
-def _painted(depth_m: F32, camera: Pinhole, rgb: U8, by: Pinhole, T_color_depth: F64) -> U8:
+def _painted(image: RgbdImage, by: RgbdImage, T_color_depth: F64) -> U8:
     """Colours (H, W, 3) of the points of a depth image in the picture of another camera."""
-    pixels = np.flatnonzero(depth_m)
-    v, u = np.divmod(pixels, depth_m.shape[1])
-    x, y, z = moved(camera.points(u, v, depth_m.ravel()[pixels]), T_color_depth).T
-    ahead, z = z > 0.01, np.maximum(z, 0.01)
-    column, row = np.rint(by.fx_px * x / z + by.cx_px), np.rint(by.fy_px * y / z + by.cy_px)
-    inside = ahead & (column >= 0) & (column < rgb.shape[1]) & (row >= 0) & (row < rgb.shape[0])
-    found = np.zeros((depth_m.size, 3), np.uint8)
-    found[pixels[inside]] = rgb[row[inside].astype(np.int64), column[inside].astype(np.int64)]
-    return found.reshape(*depth_m.shape, 3)
+    pixels, (height, width) = np.flatnonzero(image.depth_m), by.rgb.shape[:2]
+    points = moved(image.points(pixels), T_color_depth)
+    points[points[:, 2] < 0.01] = np.nan
+    column, row = np.rint(by.pinhole.pixels(points)).T
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    found = np.zeros((image.depth_m.size, 3), np.uint8)
+    found[pixels[inside]] = by.rgb[row[inside].astype(np.int64), column[inside].astype(np.int64)]
+    return found.reshape(*image.depth_m.shape, 3)
 
 
-def _pinhole(bag: Bag, topics: Mapping[str, str], role: str, picture: U8 | F32, recorded_ns: int) -> Pinhole:
-    """The camera of an image, by its CameraInfo. InputError for depth through a distorted lens."""
+def _camera(
+    bag: Bag, topics: Mapping[str, str], role: str, picture: U8 | F32, recorded_ns: int
+) -> Intrinsics:
+    """The camera of an image, by its CameraInfo; of rectified images that of P."""
     topic, name, (height, width) = topics[f"{role}_info"], topics[role], picture.shape[:2]
     info = bag.last(topic, recorded_ns)
     if (info.width, info.height) != (width, height):
         raise bag.error(topic, f"is for {info.width}x{info.height} pixels, but {name} has {width}x{height}")
-    # Colour of a distorted lens is off by few pixels, which only paints points.
-    if role == "depth" and "rect" not in name and np.any(info.d):
-        fix = f"Record {name} rectified by image_proc, as image_rect"
-        raise bag.error(topic, "has a distorted lens (D)", fix)
-    # Rectified images have the camera of P.
-    k = np.array(info.p).reshape(3, 4) if "rect" in name and info.p[0] else np.array(info.k).reshape(3, 3)
+    is_ideal = "rect" in name
+    k = np.array(info.p).reshape(3, 4) if is_ideal and info.p[0] else np.array(info.k).reshape(3, 3)
     if not np.isfinite(k).all() or min(k[0, 0], k[1, 1]) < 1 or np.abs(k).max() > 1e5:
         raise bag.error(topic, "has no intrinsics in pixels (K)", "Calibrate the camera")
-    return Pinhole(float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
+    pinhole = Pinhole(float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
+    lens = () if is_ideal else tuple(np.array(info.d, np.float64).tolist())
+    return Intrinsics(f"{bag.path}: {topic}", pinhole, (width, height), info.distortion_model, lens)
 
 
 def _rgb(bag: Bag, topic: str, message: Any) -> U8:

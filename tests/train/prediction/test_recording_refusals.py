@@ -110,12 +110,12 @@ def test_topics_that_are_missing(seen: Seen, tmp_path: Path, topic: str) -> None
         assert "/camera/color/camera_info (sensor_msgs/msg/CameraInfo)" in text
 
 
-def test_a_depth_image_of_a_distorted_lens(seen: Seen, tmp_path: Path) -> None:
+def test_a_depth_image_of_an_unknown_lens(seen: Seen, tmp_path: Path) -> None:
     sent = [replace(each, topic=each.topic.replace("image_rect_raw", "image_raw")) for each in record(seen)]
     for each in sent:
         if each.topic == DEPTH_INFO:
-            each.message.d = np.full(5, 0.01)
-    refused(write(tmp_path, sent), "distorted lens", "image_proc")
+            each.message.d, each.message.distortion_model = np.full(5, 0.01), "fov"
+    refused(write(tmp_path, sent), "fov is unknown", "plumb_bob")
 
 
 def test_cut_and_packed_messages(seen: Seen, tmp_path: Path) -> None:
