@@ -32,7 +32,7 @@ from datagen.train.prediction.occupancy import FREE, OCCUPIED, UNKNOWN
 from datagen.train.prediction.predict import Prediction
 from datagen.train.scorers import Scorer
 from datagen.workers.bases.clearance import STEP_M, obstacles_of
-from datagen.workers.geometry.planar import inside_polygon
+from datagen.workers.geometry.planar import inside_polygon, signed_distances_to_convex
 from datagen.workers.houses.house import House
 from datagen.workers.rendering.embree import render_rays
 from datagen.workers.rendering.noise import add_noise
@@ -127,12 +127,16 @@ def house_map(house: House, low_m: float, high_m: float) -> OccupancyMap:
     for state, polygons in ((FREE, obstacles.floors_m), (OCCUPIED, obstacles.polygons_m[stands])):
         for polygon in polygons:
             first, last = (
-                np.floor((end - low) / _RESOLUTION_M).astype(int)
-                for end in (polygon.min(axis=0), polygon.max(axis=0))
+                np.clip(np.floor((end - low) / _RESOLUTION_M).astype(int) + more, 0, size - 1)
+                for end, more in ((polygon.min(axis=0), -1), (polygon.max(axis=0), 1))
             )
             column, row = np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(first, last, strict=True)))
             xy = low + _RESOLUTION_M * (np.stack([column, row], axis=-1).reshape(-1, 2) + 0.5)
-            inside = inside_polygon(xy, polygon).reshape(column.shape)
+            if state == FREE:
+                inside = inside_polygon(xy, polygon)
+            else:  # walls are thinner than cells
+                inside = signed_distances_to_convex(xy, polygon[None])[:, 0] < _RESOLUTION_M / 2
+            inside = inside.reshape(column.shape)
             cells[row[inside], column[inside]] = state
     origin = float(low[0]), float(low[1]), 0.0
     return OccupancyMap(house.house_id, cells, _RESOLUTION_M, origin)

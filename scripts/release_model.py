@@ -128,7 +128,7 @@ def demo_answer(scorer: ProgramScorer) -> dict[str, Any]:
     answer = predict(
         scorer,
         frame=[released.sample_frame()],
-        click=released.DEMO_CLICK,
+        map=[released.sample_frame() / released.MAP],
         base_height=released.DEMO_BASE_HEIGHT_M,
         reach=released.DEMO_REACH_M,
     )

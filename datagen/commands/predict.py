@@ -17,7 +17,7 @@ from cyclopts import Parameter, Token
 from datagen.console.command_lines import options_of, prints
 from datagen.console.options import AsJson, File, refuse_output
 from datagen.console.printing import compiling_shown, print_json, print_rows
-from datagen.released import DEMO_BASE_HEIGHT_M, DEMO_CLICK, DEMO_REACH_M, sample_frame
+from datagen.released import DEMO_BASE_HEIGHT_M, DEMO_REACH_M, MAP, sample_frame
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import whole_file
 from datagen.workers.geometry.mesh import F64
@@ -64,6 +64,10 @@ def print_prediction(
         written = [(name, str(file)) for name, file in files if file is not None]
         if goal is not None and prediction.best is None:
             written[-1] = ("goal", f"none: {goal} is not written")
+        if demo:
+            shown = f"--frame {sample_frame()} --map {sample_frame() / MAP}"
+            robot = f"--base-height {DEMO_BASE_HEIGHT_M} --reach {DEMO_REACH_M}"
+            written.append(("again", f"datagen predict {shown} {robot} --out answer.png"))
         print_rows(f"base poses by {prediction.scorer}", [*report_rows(prediction), *written])
     return 0 if prediction.best is not None else 1
 
@@ -224,7 +228,7 @@ def predict(given: PredictOptions) -> Prediction:
             given,
             demo=False,
             frame=[sample_frame()],
-            click=DEMO_CLICK,
+            map=given.map or [sample_frame() / MAP],
             base_height=given.base_height or DEMO_BASE_HEIGHT_M,
             reach=given.reach or DEMO_REACH_M,
             out=given.out or DEMO_PICTURE,

@@ -12,8 +12,8 @@ FOLDER = Path(str(files("datagen.released")))
 CHECKPOINT, PROGRAM, FRAME = "model.safetensors", "program.safetensors", "frame"
 # The facts, how the model was made, and the page of both.
 CARD, RECIPE, CARD_PAGE = "card.json", "recipe.md", "MODEL_CARD.md"
-# The click (a pixel on the blue cup) and the robot of `datagen predict --demo` on the sample frame.
-DEMO_CLICK = (390, 256)
+MAP = "map.yaml"  # of the house, in the sample frame's folder
+# The robot of `datagen predict --demo`.
 DEMO_BASE_HEIGHT_M, DEMO_REACH_M = 0.7, 0.9
 
 

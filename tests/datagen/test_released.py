@@ -94,8 +94,7 @@ def test_the_demonstration_answers_what_the_card_says(
 def test_a_frame_without_a_checkpoint_is_scored_by_the_released_model(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    u, v = released.DEMO_CLICK
-    frame = ["--frame", str(released.sample_frame()), "--click", f"{u},{v}"]
+    frame = ["--frame", str(released.sample_frame())]
     robot = ["--base-height", "0.7", "--reach", "0.9"]
     first = json_of(capsys, ["predict", *frame, *robot])
     assert first["scorer"].startswith("the released model, ")

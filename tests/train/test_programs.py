@@ -30,7 +30,7 @@ sys.meta_path.insert(0, Blocked())
 import datagen
 from datagen import released
 answer = datagen.predict(
-    frame=[released.sample_frame()], click=released.DEMO_CLICK, base_height=0.7, reach=0.9,
+    frame=[released.sample_frame()], map=[released.sample_frame() / released.MAP], base_height=0.7, reach=0.9,
 )
 print(answer.best, answer.score[answer.best])
 """

@@ -34,7 +34,7 @@ _LOOK: dict[str, tuple[Any, float, str]] = {
 _MOST_POINTS = 6_000
 _BEHIND_M = 0.05  # what is nearer than the floor by more hides it
 _NEAREST_M = 0.05  # before a camera; nearer points are not in its picture
-_MAP_COLOURS = ("#e8eef4", "#4a4a4a")  # of free and of occupied floor
+_MAP_COLOURS = (("free in the map", "#e8eef4"), ("occupied", "#4a4a4a"))
 
 
 def draw_prediction(prediction: Prediction, out: IO[bytes], ending: str = ".png") -> None:
@@ -100,15 +100,16 @@ def shown_rows(prediction: Prediction, most: int, around_m: float) -> I64:
 def _draw_plan(axes: Axes, prediction: Prediction, scale: ScalarMappable) -> None:
     offset_m, centre = prediction.cells.offset_m, prediction.center_m
     half_m, side_m = float(np.abs(offset_m).max()) + 0.35, float(np.diff(np.unique(offset_m[:, 0])[:2])[0])
+    legend: list[Any] = []
     if prediction.known is not None:
         known = prediction.known.points(centre[:2] - half_m, centre[:2] + half_m)
-        for xy, colour in zip(known, _MAP_COLOURS, strict=True):
+        for xy, (words, colour) in zip(known, _MAP_COLOURS, strict=True):
             axes.scatter(*xy.T, s=4, c=colour, lw=0, marker="s", zorder=0)
+            legend.append(Patch(fc=colour, ec="#999999", label=words))
     rows = shown_rows(prediction, _MOST_POINTS, half_m)
     rows = rows[np.argsort(prediction.seen.points_m[rows, 2])]  # higher points hide lower ones
     x, y, _ = prediction.seen.points_m[rows].T
     axes.scatter(x, y, c=prediction.seen.rgb[rows] / 255, s=2.5, lw=0, zorder=1)
-    legend: list[Any] = []
     for state in STATES:
         rows, (corners, alpha, edge) = prediction.rows(state), _LOOK[state]
         if len(rows):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datagen.released import DEMO_CLICK, sample_frame
+from datagen.released import sample_frame
 from datagen.schemas.errors import InputError
 from datagen.train.baselines.rules import Analytic
 from datagen.train.prediction import RobotSize, predict
@@ -21,7 +21,7 @@ from tests.train.prediction.seen_scenes import Seen, sensor_frame
 
 # A pixel on something that stands on a surface, and the camera's height, which is known from the depth alone.
 FRAMES = {
-    "sample": (DEMO_CLICK, 1.239),
+    "sample": ((319, 170), 1.45),
     "tum-fr3-desk": ((148, 222), 1.711),
     "tum-fr1-desk": ((466, 325), 1.570),
     "icl-living-room": ((145, 240), 0.956),
