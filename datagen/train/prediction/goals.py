@@ -14,7 +14,7 @@ import yaml
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import whole_file
 from datagen.train.inputs import F64
-from datagen.train.prediction.predict import Prediction
+from datagen.train.prediction.answer import Prediction
 from datagen.workers.geometry.transforms import inverse, translation
 from datagen.workers.robots import ROBOTS, robot_source
 

@@ -12,9 +12,9 @@ from plotly.io import to_html
 from datagen.display.html_page import html_facts, html_figure, html_page
 from datagen.display.styles import BEST, SCORE_COLOURS, TARGET
 from datagen.train.inputs import F64
+from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import STATES
 from datagen.train.prediction.pictures import shown_rows
-from datagen.train.prediction.predict import Prediction
 from datagen.train.prediction.prediction_report import report_rows
 
 _MOST_POINTS = 20_000

@@ -17,9 +17,9 @@ from matplotlib.patches import Patch, Polygon
 from datagen.display.figures import draw_frame, new_sheet, save_sheet, write_facts
 from datagen.display.styles import BEST, CAMERA, SCORE_COLOURS, TARGET
 from datagen.train.inputs import F64, I64
+from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import BLOCKED, CLEAR, STATES, UNREACHABLE, UNSEEN
 from datagen.train.prediction.frames import RgbdImage
-from datagen.train.prediction.predict import Prediction
 from datagen.train.prediction.prediction_report import report_rows
 
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2

@@ -4,32 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from io import BytesIO
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from datagen.released import RELEASED, released_program
 from datagen.schemas.errors import InputError
-from datagen.schemas.specification import CandidateParams, ObservationParams
+from datagen.schemas.specification import CandidateParams
 from datagen.train.arrivals import Arrival
 from datagen.train.headings import refuse_other_heading, trained_side_deg
-from datagen.train.inputs import F64, I64, Array, Batch, CandidateInputs, Clouds, RobotInputs
+from datagen.train.inputs import F64, Array, Batch, CandidateInputs, Clouds, RobotInputs
+from datagen.train.prediction.answer import CROP, Prediction
 from datagen.train.prediction.base_cells import (
     BLOCKED,
     CLEAR,
     STATES,
     UNSEEN,
     BaseCells,
-    Choice,
     RobotSize,
     choose,
-    headings,
     observe_cells,
-    seen_share,
 )
 from datagen.train.prediction.frames import SensorFrame, image_frame
 from datagen.train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
@@ -40,155 +35,7 @@ from datagen.train.prediction.target import Filled, TargetBox, fill_target, loca
 from datagen.train.prediction.trained_robots import robot_notes, trained_robots
 from datagen.train.program_scorer import ProgramScorer
 from datagen.train.scorers import ModelScorer, Scorer, scored
-from datagen.workers.geometry.transforms import inverse, yaw_pose
 from datagen.workers.rendering.cloud import Cloud
-
-# The margin is to this rank: neighbours of the best have nearly its score.
-_RANK = 10
-_SURE, _LIKELY = 0.8, 0.5
-# Robots stop that far from their goals; less of the surroundings seen than this share says little.
-_LEAST_MISS_M, _LEAST_SEEN = 0.03, 0.1
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Prediction:
-    """A scored grid of base poses around the target, with its explanation. World: floor z = 0."""
-
-    scorer: str
-    robot: RobotSize
-    frames: tuple[SensorFrame, ...]
-    grounds: tuple[Ground, ...]  # one a frame
-    seen: SeenPoints
-    target: TargetBox
-    filled: Filled | None  # None where no mask was given or clicked
-    cloud: Cloud
-    cells: BaseCells
-    score: F64  # (N,)
-    choice: Choice
-    arrival: Arrival | None
-    known: KnownFloor | None
-    # Codes and texts about the robot: its sizes, and whether its hand can hold the target.
-    doubts: tuple[tuple[str, str], ...]
-    notes: tuple[str, ...]
-
-    def __repr__(self) -> str:
-        if self.best is None:
-            return f"Prediction(none: {'; '.join(self.reasons)})"
-        x, y = self.base_xy_m[self.best]
-        pose = f"x {x:.3f} m, y {y:.3f} m, yaw {math.degrees(self.yaw_rad[self.best]):.1f} deg"
-        return f"Prediction({self.level}: {pose}, score {self.score[self.best]:.3f})"
-
-    def _repr_png_(self) -> bytes:
-        """What notebooks show: the picture of `datagen predict --out`."""
-        from datagen.train.prediction.pictures import draw_prediction
-
-        with BytesIO() as drawn:
-            draw_prediction(self, drawn)
-            return drawn.getvalue()
-
-    @property
-    def best(self) -> int | None:
-        """Row of the best allowed base pose; None where there is none, or none with a good score."""
-        return self.choice.best
-
-    @property
-    def center_m(self) -> F64:
-        """The target's centre (3,)."""
-        return np.array(self.target.center_m)
-
-    @property
-    def base_xy_m(self) -> F64:
-        """Base positions (N, 2)."""
-        return self.center_m[:2] + self.cells.offset_m
-
-    @property
-    def yaw_rad(self) -> F64:
-        """Headings (N,), counter-clockwise from x: towards the target, or with the robot's side to it."""
-        return headings(self.cells.offset_m, self.robot)
-
-    def T_world_base(self, row: int) -> F64:
-        """Pose (4, 4) of the arm's mount at one base pose: at base height, x to the front of the base."""
-        x, y = self.base_xy_m[row]
-        return yaw_pose(float(x), float(y), self.robot.base_height_m, float(self.yaw_rad[row]))
-
-    def T_camera_base(self, row: int) -> F64:
-        """The same pose in the frame of the first camera."""
-        return inverse(self.grounds[0].T_world_camera) @ self.T_world_base(row)
-
-    def rows(self, state: str) -> I64:
-        """Rows of the base poses of one state, best first."""
-        rows = np.flatnonzero(self.cells.state == STATES.index(state))
-        return rows[np.argsort(-self.score[rows], kind="stable")]
-
-    @property
-    def margin(self) -> float | None:
-        """Score of the best minus that of the 10th in its state; None where there are fewer."""
-        if self.best is None:
-            return None
-        rows = self.rows(STATES[int(self.cells.state[self.best])])
-        return float(self.score[self.best] - self.score[rows[_RANK - 1]]) if len(rows) >= _RANK else None
-
-    @cached_property
-    def crop_seen(self) -> float:
-        """Share of the floor plan around the target in which anything was measured."""
-        return seen_share(self.cloud.points_m[: self.cloud.n].astype(np.float32), _CROP.crop_radius_m)
-
-    @property
-    def target_points(self) -> int:
-        """Points of the target in the cloud that was scored."""
-        return int(self.cloud.target_mask.sum())
-
-    @property
-    def missing_depth(self) -> float | None:
-        """Share of the frames' pixels without depth; None for clouds without pictures."""
-        shares = [(f.image.depth_m == 0).mean() for f in self.frames if f.image is not None]
-        return float(np.mean(shares)) if shares else None
-
-    @property
-    def level(self) -> Literal["good", "doubtful", "none"]:
-        """Whether to drive there: "none" without a best pose, "doubtful" where `reasons` speak against it."""
-        return "none" if self.best is None else "doubtful" if self.reasons else "good"
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """Why the answer is no better than it is; empty for a good one."""
-        return tuple(text for _, text in self.coded_reasons)
-
-    @property
-    def coded_reasons(self) -> tuple[tuple[str, str], ...]:
-        """The reasons, each with a short code for programs."""
-        if self.best is not None:
-            return self.doubts_about(self.best)
-        nominal, unseen = self.choice.nominal, self.rows(UNSEEN)
-        reasons = [("no_clear_pose", "no clear base pose was observed around the target")]
-        if nominal is not None:
-            text = f"the highest score of a clear base pose is only {self.score[nominal]:.3f}"
-            reasons = [("low_score", text)]
-        if len(unseen) and (nominal is None or self.score[unseen[0]] >= _LIKELY):
-            reasons.append(("unseen_left", "unseen ones are left: show their floor in more frames"))
-        return tuple(reasons)
-
-    def doubts_about(self, row: int) -> tuple[tuple[str, str], ...]:
-        """Codes and texts of what speaks against one base pose; how far it may be missed only of the best."""
-        score, expected = self.score[row], self.choice.expected
-        miss_m = self.choice.miss_m if row == self.best else None
-        is_unseen = self.cells.state[row] == STATES.index(UNSEEN)
-        is_tight = expected is None and miss_m is not None and miss_m < _LEAST_MISS_M
-        fails = expected is not None and expected[row] < _LIKELY
-        few = self.target_points < _CROP.min_target_points
-        doubts = (
-            ("medium_score", f"a medium score, {score:.3f}", score < _SURE),
-            ("floor_not_visible", "the floor there or on the way is not visible", is_unseen),
-            ("small_tolerance", f"scores stay good only within {miss_m or 0.0:.2f} m of it", is_tight),
-            ("failure_likely", "with the arrival error, failure is likelier than success", fails),
-            ("floor_uncertain", "the floor is uncertain", any(g.doubt is not None for g in self.grounds)),
-            ("few_target_points", "few points of the target", few),
-            ("few_surroundings", "few surroundings were observed", self.crop_seen < _LEAST_SEEN),
-        )
-        return (*((code, text) for code, text, holds in doubts if holds), *self.doubts)
-
-
-_CROP = ObservationParams()
 
 
 def load_scorer(checkpoint: str | Path | None = None) -> ModelScorer | ProgramScorer:
@@ -265,7 +112,7 @@ def predict(
         x, y, z = (float(c) for c in target_center_m)
         target = replace(target, center_m=(x, y, z), how="given")
     centre = np.array(target.center_m)
-    cloud = crop_cloud(seen, centre, _CROP, np.random.default_rng(seed))
+    cloud = crop_cloud(seen, centre, CROP, np.random.default_rng(seed))
     yaw_rad = 0.0 if arrival is None else arrival.yaw_std_rad
     cells = observe_cells(seen, centre, robot, _grid(grid, half_width_m), yaw_rad, known)
     score = scored(scorer, _batch(cloud, target, robot, cells))
@@ -398,11 +245,11 @@ def _notes(grounds: Sequence[Ground], filled: Filled | None, cloud: Cloud) -> tu
         notes.append(
             f"{filled.missing_pixels} target pixels without depth ({share:.0%}) were filled from neighbours"
         )
-    if cloud.n < _CROP.n_points:
+    if cloud.n < CROP.n_points:
         notes.append(
-            f"only {cloud.n} points within {_CROP.crop_radius_m:g} m of the target, of {_CROP.n_points}"
+            f"only {cloud.n} points within {CROP.crop_radius_m:g} m of the target, of {CROP.n_points}"
         )
     few = int(cloud.target_mask.sum())
-    if few < _CROP.min_target_points:
-        notes.append(f"only {few} points on the target, of {_CROP.min_target_points}")
+    if few < CROP.min_target_points:
+        notes.append(f"only {few} points on the target, of {CROP.min_target_points}")
     return tuple(notes)

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import STATES
-from datagen.train.prediction.predict import Prediction
 
 _OWN_AXES = (
     "z up, floor at z = 0, origin on the floor below the first camera; x to its right, y ahead of it, level"
@@ -38,6 +38,10 @@ def report_rows(prediction: Prediction) -> list[tuple[str, str]]:
     rows.append(("poses", ", ".join(f"{len(p.rows(state))} {state}" for state in STATES)))
     if len(unseen):
         rows.append(("unseen", f"the best is {_described(p, int(unseen[0]))}"))
+    if (look := p.look_next) is not None:
+        pan, tilt = np.degrees(look)
+        side = f"turned {abs(pan):.0f} deg to the {'left' if pan > 0 else 'right'}"
+        rows.append(("look next", f"{side}, {tilt:.0f} deg below level: the floor of the best unseen pose"))
     x, y, z = p.target.center_m
     residual = "not visible" if floor.residual_m is None else f"residual {1000 * floor.residual_m:.1f} mm"
     missing = "" if p.missing_depth is None else f", {p.missing_depth:.1%} of the depth missing"
@@ -70,6 +74,7 @@ def document(prediction: Prediction) -> dict[str, Any]:
         "notes": list(p.notes),
         "world": _world_axes(p),
         "best": None if p.best is None else _pose(p, p.best),
+        "look_next_deg": None if p.look_next is None else np.degrees(p.look_next).tolist(),
         "best_unseen": None if not len(unseen) else _pose(p, int(unseen[0])),
         "arrival": None if p.arrival is None else p.arrival.text,
         "may_miss_m": p.choice.miss_m,

@@ -120,7 +120,7 @@ def test_a_frame_as_robots_and_data_sets_have_it(
     read = "depth was read in steps of 0.001 m (16-bit numbers)"
     assert sum(note.startswith(read) for note in usual["notes"]) == 1
     assert not any("depth was read" in note for note in found["notes"])
-    refused([*own, "--out", str(tmp_path / "depth" / "1.3.png")], capsys, "is a picture of the frame")
+    refused([*own, "--out", str(tmp_path / "depth" / "1.3.png")], capsys, "is a file of the input")
 
 
 def test_a_robots_file_gives_its_sizes_and_the_heading_of_its_side(

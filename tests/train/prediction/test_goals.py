@@ -19,9 +19,9 @@ import datagen.workers.robots
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array, Batch
 from datagen.train.prediction import KnownFloor, RobotSize, predict
+from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import STATES
 from datagen.train.prediction.goals import MOUNTS_M, alternatives, write_goal
-from datagen.train.prediction.predict import Prediction
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.robots import robot_source
 from tests.sim_extra import named_robots, needs_sim

@@ -13,9 +13,9 @@ from datagen.released import sample_frame
 from datagen.schemas.errors import InputError
 from datagen.train.baselines.rules import Analytic
 from datagen.train.prediction import RobotSize, predict
+from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame, read_place
 from datagen.train.prediction.ground import find_ground, level_pose
-from datagen.train.prediction.predict import Prediction
 from datagen.workers.geometry.mesh import F64
 from tests.train.prediction.seen_scenes import Seen, sensor_frame
 

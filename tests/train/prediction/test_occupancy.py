@@ -13,10 +13,10 @@ from PIL import Image
 
 from datagen.schemas.errors import InputError
 from datagen.train.prediction import KnownFloor, OccupancyMap, RobotSize, predict, read_map
+from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import STATES
 from datagen.train.prediction.frames import SensorFrame
 from datagen.train.prediction.occupancy import FREE, OCCUPIED, UNKNOWN
-from datagen.train.prediction.predict import Prediction
 from datagen.train.scorers import ModelScorer
 from tests.train.prediction.seen_scenes import Seen, sensor_frame
 

@@ -14,10 +14,10 @@ from datagen.schemas.specification import CandidateParams
 from datagen.train.baselines.rules import Analytic
 from datagen.train.inputs import Array, Batch
 from datagen.train.prediction import RobotSize, predict
+from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import STATES
 from datagen.train.prediction.frames import SensorFrame
 from datagen.train.prediction.ground import level_pose
-from datagen.train.prediction.predict import Prediction
 from datagen.train.scorers import ModelScorer, Scorer
 from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.mesh import F64
@@ -245,6 +245,18 @@ def test_a_cube_wider_than_the_hand_opens_is_doubtful(
     answer = of(scorer, frame, allow_unseen=True)
     assert answer.target.narrowest_m == pytest.approx(side_m, abs=0.015)
     assert any("only a rim or a handle" in reason for reason in answer.reasons) != is_held
+
+
+def test_a_look_where_it_is_advised_shows_that_floor(seen: Seen, scorer: ModelScorer) -> None:
+    first = of(scorer, sensor_frame(seen))
+    assert first.look_next is not None
+    pan, tilt = first.look_next
+    T = seen.camera.T_world_camera
+    yaw = np.arctan2(T[1, 2], T[0, 2]) + pan
+    ahead = np.array([np.cos(yaw) * np.cos(tilt), np.sin(yaw) * np.cos(tilt), -np.sin(tilt)])
+    unseen = int(first.rows("unseen")[0])
+    there = np.append(first.base_xy_m[unseen], 0.0) - T[:3, 3]
+    np.testing.assert_allclose(ahead, there / np.linalg.norm(there), atol=1e-9)
 
 
 def test_missing_depth_on_the_target_is_filled_and_reported(seen: Seen, scorer: ModelScorer) -> None:
