@@ -21,7 +21,7 @@ from datagen.schemas.errors import printable
 
 _WIDTH_IN = 11.0  # at 800 pixels, as pages show pictures, text of 10 points is then 10 pixels high
 _DPI = 120
-_LINE_IN, _TEXT_POINTS = 0.19, 60  # of facts: height of a line, and where texts begin
+_LINE_IN, _TEXT_POINTS = 0.19, 68  # of facts: height of a line, and where texts begin
 _MOST_CHARACTERS = 60  # in a name: a longer one leaves no room for axes
 
 
