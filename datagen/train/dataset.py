@@ -166,7 +166,8 @@ class SampleStream:
 
         needs = augment.fields if augment else ()
         names = list(dict.fromkeys([*_CORE, *extra, *needs]))
-        parts = open_parts(paths, list(dict.fromkeys([*names, *TABLE_FIELDS])), allow_incomplete)
+        uneven = tuple({"object_digest"} - set(names))
+        parts = open_parts(paths, list(dict.fromkeys([*names, *TABLE_FIELDS])), allow_incomplete, uneven)
         self._extra = tuple(dict.fromkeys(extra))
         self._shards = [(s, {n: p.arrays[n] for n in names}, p.robot) for p in parts for s in p.shards]
         self._dims = {name: parts[0].arrays[name].dims[0] for name in names}

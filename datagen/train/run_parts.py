@@ -70,11 +70,14 @@ def read_robots(parts: Iterable[RunPart]) -> None:
 
 
 def open_parts(
-    paths: Sequence[Path | str], names: Sequence[str], allow_incomplete: bool = False
+    paths: Sequence[Path | str],
+    names: Sequence[str],
+    allow_incomplete: bool = False,
+    uneven: Sequence[str] = (),
 ) -> list[RunPart]:
     """The runs at all paths, in order, with the named arrays, which have equal types in all of them.
 
-    InputError for a path without a run, an unknown schema, a missing field, or missing samples of the plan
+    Rows of `uneven` ones may have other lengths: scenes of some runs have more clutter. InputError for a path without a run, an unknown schema, a missing field, or missing samples of the plan
     (unless `allow_incomplete`).
     """
     if not paths:
@@ -83,7 +86,8 @@ def open_parts(
     for part in parts[1:]:
         for name, ours in part.arrays.items():
             first = parts[0].arrays[name]
-            if (ours.dtype, ours.dims, ours.shape[1:]) != (first.dtype, first.dims, first.shape[1:]):
+            same_rows = name in uneven or ours.shape[1:] == first.shape[1:]
+            if (ours.dtype, ours.dims) != (first.dtype, first.dims) or not same_rows:
                 problem = f"{_words(ours)}, and {_words(first)} in {parts[0].place}"
                 raise InputError(part.place, name, problem, "Read runs of equal parameters together")
     return parts

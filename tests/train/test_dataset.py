@@ -221,6 +221,11 @@ def test_clutter_that_is_absent_is_no_object(tmp_path: Path):
     run = make_small_run(tmp_path / "run", 24, per_scene=4, config=config)
     digests = {str(digest) for digest in np.ravel(arrays_of(run)["object_digest"])}
     assert "" in digests and SampleStream([run]).object_digests() == digests - {""}
+    # Runs with more or less clutter are read together.
+    tops = make_small_run(tmp_path / "tops", 24, "--seed", "1", per_scene=4)
+    both = SampleStream([run, tops])
+    assert both.object_digests() == digests - {""} | set(np.ravel(arrays_of(tops)["object_digest"]))
+    assert sum(len(batch.clouds) for batch in both.epoch(0)) == 12
 
 
 def test_houses_choose_the_scenes(place: str):
