@@ -77,8 +77,9 @@ def open_parts(
 ) -> list[RunPart]:
     """The runs at all paths, in order, with the named arrays, which have equal types in all of them.
 
-    Rows of `uneven` ones may have other lengths: scenes of some runs have more clutter. InputError for a path without a run, an unknown schema, a missing field, or missing samples of the plan
-    (unless `allow_incomplete`).
+    Rows of `uneven` ones may have other lengths: scenes of some runs have more clutter. InputError for a path
+    without a run, an unknown schema, a missing field, or missing samples of the plan (unless
+    `allow_incomplete`).
     """
     if not paths:
         raise InputError("training data", "", "no run is given", "Name at least one run folder")
