@@ -47,7 +47,7 @@ class JobProgress:
     def tick(self, totals: JobTotals) -> None:
         if (now_s := self._shown.clock()) >= self._next_note_s:
             self._running, self._next_note_s = running_attempts(self._notes), now_s + NOTES_S
-        self._pace.see(totals.labels + self._running.labels)
+        self._pace.see(totals.labels + self._in_flight(totals))
         done, of = self._done_before + totals.finished, self._done_before + totals.shards
         self._shown.update("shards", done, of, lambda: self._figures(totals))
 
@@ -59,7 +59,11 @@ class JobProgress:
     def left_s(self, totals: JobTotals) -> float | None:
         """Seconds until the last shard at the rate of the last minute; None while it is unknown."""
         more = (totals.shards - totals.finished) * self._labels_per_shard
-        return self._pace.left_s(more - self._running.labels)
+        return self._pace.left_s(more - self._in_flight(totals))
+
+    def _in_flight(self, totals: JobTotals) -> int:
+        """Labels of running attempts, but no more than they will commit: drawn scenes may be rejected."""
+        return min(self._running.labels, totals.in_flight * self._labels_per_shard)
 
     def _figures(self, totals: JobTotals) -> tuple[str, dict[str, object]]:
         rate, left_s = self._pace.per_s(), self.left_s(totals)

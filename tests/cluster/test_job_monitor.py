@@ -102,6 +102,23 @@ def test_a_state_can_be_read_when_killed_attempts_had_labels(
     assert job.state is not None and job.state.labels_per_s == 0
 
 
+def test_labels_of_rejected_scenes_do_not_hide_the_rate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, jobs = FakeClock(), WatchedJobs(tmp_path, FakeClock(), lambda now_s: None)
+    recorder = JobRecorder(jobs, ("datagen",), "local", shards=100)
+    seen = "datagen.cluster.job_monitor.running_attempts"
+    # Five draws of two scenes of 10 labels, of which the last is kept.
+    monkeypatch.setattr(seen, lambda notes: Running(labels=int(2 * clock.now_s) % 100))
+    with Progress(True, clock, Console(file=io.StringIO())) as shown:
+        monitor = JobMonitor(recorder, StopRequest(), shown, labels_per_shard=10)
+        for clock.now_s in range(250):
+            done = 2 * (clock.now_s // 50)
+            monitor.tick(JobTotals(100, committed=done, labels=10 * done, in_flight=2))
+    rates = [state.labels_per_s for _, state in jobs.states][6:]
+    assert len(rates) > 15 and all(0.2 < rate < 1.0 for rate in rates)
+
+
 def test_a_request_drains_the_job_and_is_published_at_once(tmp_path: Path) -> None:
     job = watch(tmp_path, lambda now_s: "drain" if now_s >= 30 else None)
     assert job.summary.end == "interrupted"
