@@ -38,6 +38,7 @@ else:
     Prediction, Frames, Maps, Checkpoint, Outline = Any, Sequence[Path], Sequence[Path], str | Path, str
 
 T = TypeVar("T")
+_UNSET = Parameter(show_default=False)  # an empty list says nothing
 _LARGEST_M = 10.0
 # Written by --demo in the working folder, unless --out or --html is given.
 DEMO_PICTURE, DEMO_PAGE = Path("demo.png"), Path("demo.html")
@@ -138,8 +139,8 @@ class PredictOptions:
     demo: bool = False
     frame: Frames | None = None
     bag: File | None = None
-    at: Sequence[float] = ()
-    topic: Sequence[str] = ()
+    at: Annotated[Sequence[float], _UNSET] = ()
+    topic: Annotated[Sequence[str], _UNSET] = ()
     click: Annotated[tuple[int, int] | None, Parameter(converter=_pixel, n_tokens=1, metavar="STR")] = None
     camera_height: float | None = None
     gravity: Annotated[
@@ -150,8 +151,8 @@ class PredictOptions:
     footprint: Annotated[Outline | None, Parameter(converter=_text, n_tokens=1, metavar="STR")] = None
     depth_scale: float | None = None
     allow_unseen: bool = False
-    map: Maps = ()
-    keep_out: Maps = ()
+    map: Annotated[Maps, _UNSET] = ()
+    keep_out: Annotated[Maps, _UNSET] = ()
     arrival: str | None = None
     out: File | None = None
     html: File | None = None
