@@ -211,28 +211,31 @@ def _document(path: Path) -> JsonNode:
 
 
 def _opened(path: Path, formats: tuple[str, ...], mode: str | None) -> Image.Image:
+    return decoded(read_regular(path, MAX_FILE_BYTES, FILE_FIX), path, formats, mode)
+
+
+def decoded(data: bytes, place: str | Path, formats: tuple[str, ...], mode: str | None = None) -> Image.Image:
     """A decoded picture. Its size is checked before its pixels are decoded."""
     kinds = " or ".join(formats)
-    data = io.BytesIO(read_regular(path, MAX_FILE_BYTES, FILE_FIX))
     try:
         with warnings.catch_warnings():
             # Our own limit of size is stricter than the one that warns; other warnings are of damaged tags.
             warnings.simplefilter("ignore")
-            with Image.open(data, formats=formats) as image:
-                _refuse_size(path, *image.size)
+            with Image.open(io.BytesIO(data), formats=formats) as image:
+                _refuse_size(place, *image.size)
                 image.load()
                 return image.copy() if mode is None else image.convert(mode)
     except Image.DecompressionBombError:
-        _refuse_size(path, MAX_SIDE_PX + 1, MAX_SIDE_PX + 1)
+        _refuse_size(place, MAX_SIDE_PX + 1, MAX_SIDE_PX + 1)
         raise
     except InputError:
         raise
     except _DAMAGED_IMAGE as error:
         problem = f"is not a readable {kinds} image ({type(error).__name__})"
-        raise InputError(path, "", problem, f"Save it again as {kinds}") from None
+        raise InputError(place, "", problem, f"Save it again as {kinds}") from None
 
 
-def _refuse_size(path: Path, width: int, height: int) -> None:
+def _refuse_size(place: str | Path, width: int, height: int) -> None:
     if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS:
         size = "too many" if width > MAX_SIDE_PX and width == height else f"{width}x{height}"
-        raise InputError(path, "", f"has {size} pixels", f"Give a frame of at most {MAX_PIXELS:,} pixels")
+        raise InputError(place, "", f"has {size} pixels", f"Give a frame of at most {MAX_PIXELS:,} pixels")

@@ -5,10 +5,8 @@ Units and axes are those of REP 103, frames those of REP 105, depth images those
 
 from __future__ import annotations
 
-import io
 import math
 import struct
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -22,7 +20,7 @@ from rosbags.rosbag2 import ReaderError
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import F32, F64, U8
 from datagen.train.prediction.bags import DAMAGED, FIX, OTHER_FRAME, Bag, stamp_ns, windows
-from datagen.train.prediction.files import MAX_PIXELS, MAX_SIDE_PX, checked_pose, valid_depth
+from datagen.train.prediction.files import MAX_PIXELS, MAX_SIDE_PX, checked_pose, decoded, valid_depth
 from datagen.train.prediction.frames import RgbdImage, SensorFrame, image_frame, moved
 from datagen.train.prediction.intrinsics import Intrinsics, Pinhole
 from datagen.train.prediction.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyMap
@@ -252,19 +250,8 @@ def _pixels(bag: Bag, topic: str, message: Any, encodings: Mapping[str, tuple[st
 
 
 def _picture(bag: Bag, topic: str, data: bytes) -> Image.Image:
-    """A decoded PNG or JPEG. Its size is checked before its pixels are decoded."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit is stricter
-            image = Image.open(io.BytesIO(data), formats=("PNG", "JPEG"))
-        _refuse_size(bag, topic, *image.size)
-        image.load()
-        return image
-    except InputError:
-        raise
-    except (*DAMAGED, Image.DecompressionBombError) as error:
-        problem = f"a message is not a readable PNG or JPEG ({type(error).__name__})"
-        raise bag.error(topic, problem, OTHER_FRAME) from None
+    """A decoded PNG or JPEG of a message."""
+    return decoded(data, f"{bag.path}: a message of {topic}", ("PNG", "JPEG"))
 
 
 def _refuse_size(bag: Bag, topic: str, width: int, height: int) -> None:
