@@ -70,6 +70,7 @@ _HEADINGS: dict[str, dict[str, tuple[str, str]]] = {
         ),
         "benchmark": ("datagen.commands.benchmark:app", "Make and score the frozen benchmark."),
         "predict": ("datagen.commands.predict:predict", "Find a base pose in a depth camera's frame."),
+        "serve": ("datagen.commands.serve:serve", "Find base poses for programs, over HTTP."),
     },
     "This machine": {
         "assets": ("datagen.assets.cli:app", "List, fetch and split houses and objects."),
@@ -83,6 +84,7 @@ VERBS = {verb: defined for verbs in _HEADINGS.values() for verb, defined in verb
 _EXTRA_OF: dict[str, str] = dict.fromkeys(_HEADINGS["Models"], "train") | {
     "benchmark": "predict",
     "predict": "predict",
+    "serve": "serve",
 }
 
 

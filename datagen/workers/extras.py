@@ -58,6 +58,7 @@ EXTRAS: dict[str, Extra] = {
         "predict with the released model, benchmark score of files of scores and of rules",
         {"safetensors": "safetensors", "yaml": "pyyaml", **_PICTURES},
     ),
+    "serve": Extra("serve", {"fastapi": "fastapi", "uvicorn": "uvicorn"}),
     "train": Extra(
         "train, evaluate; predict with other models and as a page",
         {

@@ -1,0 +1,102 @@
+"""`datagen serve`: base poses over HTTP, for programs that have no Python or cannot import this package."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from datagen.commands.predict import predict
+from datagen.console.command_lines import options_of
+from datagen.console.options import File
+from datagen.display.progress import Progress
+from datagen.schemas.errors import InputError
+from datagen.schemas.safe_files import read_regular
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
+
+_UNSET = Parameter(show_default=False)
+
+
+@dataclass(frozen=True)
+class ServeOptions:
+    """Options of `serve`.
+
+    Args:
+        checkpoint: Checkpoint of `datagen train` [default: the released model]
+        robot: Robot, or its file ROBOT.toml, as of `predict`.
+        base_height: Height of the arm's mount above the floor (m).
+        reach: Reach of the arm from its mount (m).
+        map: Map of the floor, map.yaml; repeatable.
+        keep_out: Map of which no base may stand on occupied cells.
+        host: Address to listen on.
+        port: Port to listen on.
+        token: File with the word that requests must give as `Authorization: Bearer WORD`; needed beyond
+            loopback addresses.
+    """
+
+    checkpoint: Annotated[str | None, Parameter(name="CHECKPOINT")] = None
+    _: KW_ONLY
+    robot: str | None = None
+    base_height: float | None = None
+    reach: float | None = None
+    map: Annotated[Sequence[Path], _UNSET] = ()
+    keep_out: Annotated[Sequence[Path], _UNSET] = ()
+    host: str = "127.0.0.1"
+    port: int = 8765
+    token: File | None = None
+
+
+@options_of(ServeOptions)
+def serve(given: ServeOptions) -> None:
+    """Answer requests for base poses: a frame in, an answer out; frames of a session are fused.
+
+    POST /base takes an .npz with rgb, depth, intrinsics and optionally mask and T_world_camera as its body,
+    and click, session, arrival, allow_unseen, camera_height and candidates as its query. /docs lists all.
+
+    For example: datagen serve --robot fetch --map map.yaml
+    """
+    import uvicorn
+
+    app = app_of(given)
+    with Progress() as shown:
+        shown.phase(f"listening on http://{given.host}:{given.port}, described at /docs")
+        uvicorn.run(app, host=given.host, port=given.port, log_level="warning", limit_concurrency=64)
+
+
+def app_of(given: ServeOptions) -> FastAPI:
+    """The application. InputError for options that cannot be used."""
+    from datagen.train.prediction import load_scorer, read_map
+    from datagen.train.prediction.service import make_app
+
+    token = None if given.token is None else _token(Path(given.token))
+    if token is None and not _is_loopback(given.host):
+        fix = "Give --token FILE, or listen on 127.0.0.1"
+        raise InputError("--host", given.host, "is no loopback address, and there is no --token", fix)
+    scorer, sizes = load_scorer(given.checkpoint), ("robot", "base_height", "reach")
+    fixed: dict[str, Any] = {name: getattr(given, name) for name in sizes}
+    fixed |= {"map": [read_map(each) for each in given.map]}
+    fixed |= {"keep_out": [read_map(each) for each in given.keep_out]}
+    return make_app(
+        lambda frames, options: predict(scorer, frame=frames, **fixed, **options), scorer.name, token
+    )
+
+
+def _token(path: Path) -> str:
+    word = read_regular(path, 4096, "Name a file with one word").decode("utf-8", "replace").strip()
+    if not re.fullmatch(r"[!-~]{16,}", word):
+        raise InputError(path, "--token", "is not one word of 16 or more characters", "Write a random word")
+    return word
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,102 @@
+"""Base poses over HTTP: the answers of `predict`, bounded sessions, and what hostile requests get."""
+
+from __future__ import annotations
+
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+import datagen
+from datagen import cli
+from datagen.commands.serve import ServeOptions, app_of
+from datagen.train.prediction import service
+from tests.refusals import refused
+from tests.train.prediction.seen_scenes import Seen, camera_arrays, draw_seen
+
+SIZES: dict[str, Any] = {"base_height": 0.7, "reach": 0.9}
+
+
+@pytest.fixture(scope="module")
+def seen() -> Seen:
+    return draw_seen(0)
+
+
+@pytest.fixture(scope="module")
+def client() -> TestClient:
+    return TestClient(app_of(ServeOptions(**SIZES)))
+
+
+def packed(seen: Seen, **changed: Any) -> bytes:
+    """The body of a request: an .npz of the frame."""
+    rgb, depth, K, T, mask = camera_arrays(seen)
+    arrays = {"rgb": rgb, "depth": depth, "intrinsics": K, "mask": mask, "T_world_camera": T} | changed
+    with BytesIO() as file:
+        np.savez_compressed(file, **{name: a for name, a in arrays.items() if a is not None})
+        return file.getvalue()
+
+
+def test_the_answer_is_that_of_predict(client: TestClient, seen: Seen) -> None:
+    said = client.post("/base", content=packed(seen), params={"allow_unseen": True, "candidates": True})
+    assert said.status_code == 200
+    rgb, depth, K, T, mask = camera_arrays(seen)
+    answer = datagen.find_base(rgb, depth, K, T, mask=mask, allow_unseen=True, **SIZES)
+    document = said.json()
+    assert document["level"] == answer.level and document["best"]["index"] == answer.best
+    np.testing.assert_allclose([c["score"] for c in document["candidates"]], answer.score, atol=1e-6)
+    short = client.post("/base", content=packed(seen), params={"allow_unseen": True}).json()
+    assert short == {key: value for key, value in document.items() if key != "candidates"}
+
+
+def test_frames_of_a_session_are_fused_and_bounded(client: TestClient, seen: Seen) -> None:
+    first = client.post("/base", content=packed(seen), params={"session": "kitchen"}).json()
+    assert len(first["T_world_camera"]) == 1
+    for count in range(2, service.MOST_FRAMES + 3):
+        said = client.post("/base", content=packed(seen), params={"session": "kitchen"}).json()
+        assert len(said["T_world_camera"]) == min(count, service.MOST_FRAMES)
+    for k in range(service.MOST_SESSIONS + 2):
+        client.post("/base", content=packed(seen), params={"session": f"s{k}"})
+    assert client.get("/health").json()["sessions"] == service.MOST_SESSIONS
+    assert client.delete("/sessions/s5").json() == {"was_there": True}
+    assert client.delete("/sessions/s5").json() == {"was_there": False}
+
+
+@pytest.mark.parametrize(
+    ("body", "params", "status", "words"),
+    [
+        (b"", {}, 422, ".npz"),
+        (b"PK\x05\x06" + bytes(18), {}, 422, "has none of"),
+        (None, {"click": "1"}, 422, "click"),
+        (None, {"click": "1,1"}, 422, "--click"),
+        (None, {"session": "../x"}, 422, "session"),
+        (None, {"arrival": "/etc/passwd"}, 422, "arrival"),
+        (None, {"arrival": "normal:x"}, 422, "--arrival"),
+        (None, {"camera_height": "-1"}, 422, "camera_height"),
+    ],
+)
+def test_hostile_requests_get_a_reason(
+    client: TestClient, seen: Seen, body: bytes | None, params: dict[str, str], status: int, words: str
+) -> None:
+    said = client.post("/base", content=packed(seen) if body is None else body, params=params)
+    assert said.status_code == status and words in said.text and "/tmp" not in said.text
+
+
+def test_a_large_body_is_refused(client: TestClient, seen: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service, "MOST_BYTES", 1 << 20)
+    assert client.post("/base", content=bytes(2 << 20)).status_code == 413
+
+
+def test_a_token_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "token").write_text("0123456789abcdef\n")
+    client = TestClient(app_of(ServeOptions(**SIZES, host="0.0.0.0", token=tmp_path / "token")))
+    assert client.get("/health").status_code == 401
+    for word, status in (("0123456789abcdef", 200), ("0123456789abcdeF", 401), ("é", 401)):
+        headers = {"Authorization": f"Bearer {word}".encode()}
+        assert client.get("/health", headers=headers).status_code == status
+    (tmp_path / "short").write_text("word")
+    refused(["serve", "--host", "0.0.0.0"], capsys, "is no loopback address")
+    refused(["serve", "--token", str(tmp_path / "short")], capsys, "16 or more characters")
+    assert cli.VERBS["serve"]
