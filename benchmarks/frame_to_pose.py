@@ -23,6 +23,7 @@ import numpy as np
 from datagen.console.options import Sources
 from datagen.evaluation.arrival_outcomes import PLAN, Arrived, SceneTask, make_arrivals, read_outcomes
 from datagen.replaying import places_of
+from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import SceneRows, read_scenes
 from datagen.schemas.specification import NoiseParams
@@ -63,14 +64,19 @@ def main() -> None:
     scorers: list[Scorer] = [load_scorer(options.checkpoint), ReachShare()]
     good: dict[tuple[str, str], list[bool | None]] = {}
     names = scorers[0].name, scorers[1].name
-    asked = 0
+    asked = refused = 0
     for k, stored in enumerate(read_scenes(run, range(run.n // run.layout.candidates_per_scene))):
         clear = stored.samples["base_clearance_m"] > 0
         if asked == options.scenes or not (stored.samples["label"][clear] == 1).any():
             continue
         asked += 1
         scene = reconstruct_scene(world, stored.record)
-        frame, robot = _frame(scene, k), _robot(run, stored)
+        try:
+            frame, robot = _frame(scene, k), _robot(run, stored)
+            predict(scorers[1], [frame], robot)
+        except InputError:  # too little of the target has depth
+            refused += 1
+            continue
         answers = {
             (scorer.name, setting): predict(scorer, [frame], robot, known=known, allow_unseen=unseen)
             for setting, known, unseen in _settings(scene.house.house, robot)
@@ -83,7 +89,9 @@ def main() -> None:
         outcomes = _planned(run, places, k, [each for each in arrived.values() if each is not None])
         for key, at in arrived.items():
             good.setdefault(key, []).append(None if at is None else outcomes[at.key] == "success")
-    print(f"{asked} scenes, percent of them; intervals 95%, by resampling scenes\n")
+    print(
+        f"{asked - refused} scenes, percent of them; {refused} more frames are refused. Intervals 95%, by scene.\n"
+    )
     print("| floor | method | answered | good |\n| --- | --- | --- | --- |")
     for (name, setting), found in sorted(good.items(), key=lambda row: (row[0][1], names.index(row[0][0]))):
         answered = 100 * np.mean([each is not None for each in found])
