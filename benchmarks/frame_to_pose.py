@@ -89,9 +89,7 @@ def main() -> None:
         outcomes = _planned(run, places, k, [each for each in arrived.values() if each is not None])
         for key, at in arrived.items():
             good.setdefault(key, []).append(None if at is None else outcomes[at.key] == "success")
-    print(
-        f"{asked - refused} scenes, percent of them; {refused} more frames are refused. Intervals 95%, by scene.\n"
-    )
+    print(f"{asked - refused} scenes, percent of them; {refused} more frames are refused. 95% by scene.\n")
     print("| floor | method | answered | good |\n| --- | --- | --- | --- |")
     for (name, setting), found in sorted(good.items(), key=lambda row: (row[0][1], names.index(row[0][0]))):
         answered = 100 * np.mean([each is not None for each in found])
