@@ -17,6 +17,7 @@ import argparse
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -27,11 +28,12 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import SceneRows, read_scenes
 from datagen.schemas.specification import NoiseParams
-from datagen.train.baselines.rules import ReachShare
+from datagen.train.baselines.rules import Proximity, ReachShare
 from datagen.train.prediction import KnownFloor, OccupancyMap, RobotSize, load_scorer, predict, read_footprint
 from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
 from datagen.train.prediction.occupancy import FREE, OCCUPIED, UNKNOWN
+from datagen.train.prediction.pictures import draw_prediction
 from datagen.train.scorers import Scorer
 from datagen.workers.bases.clearance import STEP_M, obstacles_of
 from datagen.workers.geometry.planar import inside_polygon, signed_distances_to_convex
@@ -46,7 +48,7 @@ from datagen.workers.world import open_world
 _RESOLUTION_M = 0.05
 _LIDAR_M = 0.2
 _SEED = 0
-_ALONE, _ADVISED = "1 frame alone", "3 up to three frames, as advised"
+_ALONE, _ADVISED, _MAPPED = "1 frame alone", "3 up to three frames, as advised", "5 full map"
 
 
 def main() -> None:
@@ -57,13 +59,14 @@ def main() -> None:
     parser.add_argument("--objects")
     parser.add_argument("--scenes", type=int, default=100)
     parser.add_argument("--checkpoint")
+    parser.add_argument("--pictures", type=Path, help="folder for the model's answers with a full map")
     options = parser.parse_args()
     run = Run.open(options.run)
     places = places_of(run, Sources(houses=options.houses, objects=options.objects))
     world = open_world(run.manifest.spec, *places)
-    scorers: list[Scorer] = [load_scorer(options.checkpoint), ReachShare()]
+    scorers: list[Scorer] = [load_scorer(options.checkpoint), ReachShare(), Proximity()]
     good: dict[tuple[str, str], list[bool | None]] = {}
-    names = scorers[0].name, scorers[1].name
+    names = tuple(scorer.name for scorer in scorers)
     asked = refused = 0
     for k, stored in enumerate(read_scenes(run, range(run.n // run.layout.candidates_per_scene))):
         clear = stored.samples["base_clearance_m"] > 0
@@ -89,6 +92,12 @@ def main() -> None:
         outcomes = _planned(run, places, k, [each for each in arrived.values() if each is not None])
         for key, at in arrived.items():
             good.setdefault(key, []).append(None if at is None else outcomes[at.key] == "success")
+        if options.pictures is not None:
+            said = [good[name, _MAPPED][-1] for name in (names[0], names[-1])]
+            own, nearest = ("none" if each is None else "good" if each else "bad" for each in said)
+            file = options.pictures / f"scene{k}-{own}-nearest-{nearest}.png"
+            with file.open("wb") as drawn:
+                draw_prediction(answers[names[0], _MAPPED], drawn)
     print(f"{asked - refused} scenes, percent of them; {refused} more frames are refused. 95% by scene.\n")
     print("| floor | method | answered | good |\n| --- | --- | --- | --- |")
     for (name, setting), found in sorted(good.items(), key=lambda row: (row[0][1], names.index(row[0][0]))):
@@ -143,7 +152,7 @@ def _settings(house: House, robot: RobotSize) -> Iterator[tuple[str, KnownFloor 
     yield _ALONE, None, False
     yield "2 unseen allowed", None, True
     yield "4 lidar map", KnownFloor((house_map(house, _LIDAR_M, _LIDAR_M),)), False
-    yield "5 full map", KnownFloor((house_map(house, STEP_M, robot.base_height_m),)), False
+    yield _MAPPED, KnownFloor((house_map(house, STEP_M, robot.base_height_m),)), False
 
 
 def house_map(house: House, low_m: float, high_m: float) -> OccupancyMap:

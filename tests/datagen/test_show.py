@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 from PIL import Image, ImageColor, ImageSequence
 
 from datagen import cli
@@ -73,7 +74,8 @@ def test_no_text_of_a_picture_lies_on_another(
     figure = drawn[0]
     figure.canvas.draw()
     lower = figure.subfigs[1]
-    facts, legend = lower.axes[0].texts[0].get_window_extent(), lower.axes[1].get_legend().get_window_extent()
+    facts = Bbox.union([text.get_window_extent() for text in lower.axes[0].texts])
+    legend = lower.axes[1].get_legend().get_window_extent()
     plans = [axes.get_tightbbox() for axes in figure.subfigs[0].axes]
     for box in (facts, legend):
         assert box.y0 >= 0 and box.x0 >= 0 and box.x1 <= figure.bbox.x1

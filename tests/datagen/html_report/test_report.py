@@ -101,7 +101,7 @@ def test_a_run_without_labels_shows_its_failures(tmp_path: Path) -> None:
 def test_a_model_shows_its_training(tmp_path: Path) -> None:
     page = report(tmp_path / "page.html", "released")
     for words in (
-        "shared, trained as stage2",
+        "shared, trained as sim-only",
         "% of the labels of validation",
         "Course of training",
         "sha256",
