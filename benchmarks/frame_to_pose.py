@@ -67,6 +67,7 @@ def main() -> None:
     scorers: list[Scorer] = [load_scorer(options.checkpoint), ReachShare(), Proximity()]
     good: dict[tuple[str, str], list[bool | None]] = {}
     names = tuple(scorer.name for scorer in scorers)
+    levels: dict[str, list[bool]] = {}
     asked = refused = 0
     for k, stored in enumerate(read_scenes(run, range(run.n // run.layout.candidates_per_scene))):
         clear = stored.samples["base_clearance_m"] > 0
@@ -92,6 +93,7 @@ def main() -> None:
         outcomes = _planned(run, places, k, [each for each in arrived.values() if each is not None])
         for key, at in arrived.items():
             good.setdefault(key, []).append(None if at is None else outcomes[at.key] == "success")
+        levels.setdefault(answers[names[0], _MAPPED].level, []).append(bool(good[names[0], _MAPPED][-1]))
         if options.pictures is not None:
             said = [good[name, _MAPPED][-1] for name in (names[0], names[-1])]
             own, nearest = ("none" if each is None else "good" if each else "bad" for each in said)
@@ -106,6 +108,8 @@ def main() -> None:
         drawn = np.random.default_rng(_SEED).choice(rate, (2000, len(rate))).mean(axis=1)
         low, high = 100 * np.quantile(drawn, (0.025, 0.975))
         print(f"| {setting} | {name} | {answered:.0f} | {100 * rate.mean():.1f} [{low:.0f}, {high:.0f}] |")
+    told = ", ".join(f"{sum(found)} of {len(found)} {level}" for level, found in sorted(levels.items()))
+    print(f"\nOf the model's answers with a full map these are good: {told}.")
 
 
 def _frame(scene: ReconstructedScene, index: int, camera: Camera | None = None, view: int = 0) -> SensorFrame:
