@@ -18,6 +18,7 @@ from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
 from datagen.schemas.stored_arrays import MAX_META_BYTES, StoredArray, arrays_of, readable, sources_of
 from datagen.schemas.zipped_stores import ZIPPED
+from datagen.workers.motion.pose_reach import known_arm
 from datagen.workers.robots import remember
 
 # Fields that join the two tables; every reader needs them.
@@ -59,9 +60,6 @@ def read_robots(parts: Iterable[RunPart]) -> None:
 
     InputError where one is missing or has changed.
     """
-    # Needs the compiler, as other parts of the arm do.
-    from datagen.workers.motion.pose_reach import known_arm
-
     for part in parts:
         arm = part.specs[0].arm if part.specs else None
         if arm is not None and arm.robot_digest is not None and not known_arm(arm.robot_key):

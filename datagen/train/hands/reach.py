@@ -8,6 +8,7 @@ import numpy.typing as npt
 from datagen.train.hands.poses import N_MEASURES
 from datagen.train.hands.sizes import HandSize, hand_size
 from datagen.train.inputs import F32, F64, I64, U8, Array, CandidateInputs, RobotInputs
+from datagen.workers.motion.pose_reach import pose_reach, reach_codes
 
 # Assumed where labels or a frame name no robot: an arm of that reach with a Franka Hand.
 UNKNOWN_ROBOT = "panda-scaled"
@@ -33,9 +34,6 @@ def hand_reach(poses: F32, robots: RobotInputs[Array], candidates: CandidateInpu
 
     Raises InputError where a robot's files are missing.
     """
-    # Needs the compiler, as other parts of the arm do.
-    from datagen.workers.motion.pose_reach import pose_reach, reach_codes
-
     axes = poses[..., N_MEASURES:].reshape(*poses.shape[:2], 3, 3).astype(np.float64)
     row = candidates.robot_row.astype(np.int64)
     turn_rad = np.zeros(len(row)) if candidates.turn_rad is None else candidates.turn_rad

@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from datagen.train.inputs import F64
+from datagen.workers.motion.pose_reach import known_arm
 from datagen.workers.robots import gripper_of
 from datagen.workers.robots.gripper import Gripper
 
@@ -46,9 +47,6 @@ _DIGITS = 4  # of measures in metres
 @lru_cache(maxsize=64)
 def hand_size(robot: str) -> HandSize:
     """The hand of a robot, by its name or file. InputError as `open_robot`."""
-    # Needs the compiler, as other parts of the arm do.
-    from datagen.workers.motion.pose_reach import known_arm
-
     known = known_arm(robot)
     measured = known["hand"] if known else measured_hand(gripper_of(robot))
     more = np.round(np.round(measured, _DIGITS) - _FRANKA_MEASURED, _DIGITS)

@@ -51,7 +51,7 @@ class OccupancyMap:
 
 @dataclass(frozen=True, eq=False)
 class KnownFloor:
-    """What maps tell of a floor: of several the first that knows, and where no base may stand."""
+    """What maps say about a floor, of several the first that knows it, and where no base may stand."""
 
     maps: tuple[OccupancyMap, ...] = ()
     keep_out: tuple[OccupancyMap, ...] = ()  # no base may stand on their occupied cells

@@ -50,7 +50,7 @@ def pose_reach(name: str, reach_m: float) -> PoseReach:
     if known:
         reaches_m = known["reach_m"]
     else:  # imported here: needs the compiler
-        from datagen.workers.motion.measured_reach import measured_arm, reaches_of
+        from datagen.workers.motion.measured_reach import reaches_of
 
         reaches_m = reaches_of(name)
     low, high = reaches_m[0], reaches_m[-1]
@@ -61,7 +61,9 @@ def pose_reach(name: str, reach_m: float) -> PoseReach:
         turns, half_m, *row = known["size"][step].tolist()
         found = PoseReach(known["code"], np.array(row[:2]), np.array(row[2:]), bool(turns), half_m)
     else:
-        found = measured_arm(name, reaches_m[step])  # pyright: ignore[reportPossiblyUnboundVariable]
+        from datagen.workers.motion.measured_reach import measured_arm
+
+        found = measured_arm(name, reaches_m[step])
     more = reach_m / reaches_m[step] if not low <= reach_m <= high else 1.0
     size = {"tcp_wrist_m": found.tcp_wrist_m * more, "half_m": float(found.half_m * more)}
     return found._replace(axis_xy_m=found.axis_xy_m * more, **size)
