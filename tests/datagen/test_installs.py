@@ -111,9 +111,9 @@ def test_the_base_keeps_runs_and_names_what_it_lacks(wheel: Path, copied: Path, 
     lacks_train: list[Command] = [
         ["train", "stage1", copied, "--out", out],
         ["evaluate", "model.ckpt", copied],
-        ["predict", "model.ckpt", "--frame", "frame", *ROBOT],
     ]
-    done = base.run(*works, ["doctor"], *lacks_labels, *lacks_train)
+    lacks_predict = ["predict", "model.ckpt", "--frame", "frame", *ROBOT]
+    done = base.run(*works, ["doctor"], *lacks_labels, *lacks_train, lacks_predict)
     for each in islice(done, len(works)):
         assert each.code == 0, each
     doctor = next(done)
@@ -123,6 +123,7 @@ def test_the_base_keeps_runs_and_names_what_it_lacks(wheel: Path, copied: Path, 
         base.assert_lacks("labels", each)
     for each in islice(done, len(lacks_train)):
         base.assert_lacks("train", each)
+    base.assert_lacks("predict", next(done))
     assert next(done, None) is None and not out.exists()
 
 

@@ -134,9 +134,9 @@ def test_the_code_of_the_documents_scores_a_pack(
 
 
 @pytest.mark.slow
-def test_the_extra_score_is_enough_in_an_empty_folder(wheel: Path, pack: Path, tmp_path: Path) -> None:
+def test_the_extra_predict_is_enough_in_an_empty_folder(wheel: Path, pack: Path, tmp_path: Path) -> None:
     site = install_wheel(wheel, tmp_path / "venv")
-    link_libraries(site, "score")
+    link_libraries(site, "predict")
     shutil.rmtree(site / "datagen" / "evaluation" / "pack", ignore_errors=True)
     shutil.copytree(pack, site / "datagen" / "evaluation" / "pack")
     (tmp_path / "empty").mkdir()
