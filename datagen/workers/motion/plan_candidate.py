@@ -19,6 +19,7 @@ from datagen.workers.motion.search import (
     ARM_COLLISION,
     NO_LIFT,
     NO_START,
+    NOT_FREE,
     SUCCESS,
     length_and_clearance,
     path_to,
@@ -71,6 +72,7 @@ class _Search:
     tried: int = 0  # poses for which inverse kinematics was tried
     furthest: int = 0  # stage
     slipped: int = 0  # poses near grasps that did not hold
+    score: float = 0.0  # share of floating-hand pulls that the pose looked at last holds
     # The row (-1: none), pose and opening of each grasp without a straight path.
     without_path: list[tuple[int, F64, int]] = field(default_factory=list)
 
@@ -89,27 +91,37 @@ class _Search:
             *at, scene.compiled_limits, self.T_root, rows, self.back, self.lift, self.found
         )
 
-    def best_first(self, poses: Poses, start: int, end: int, short: Ints) -> Ints:
-        """The free poses from `start` to `end` that can be reached, those with most samples near first."""
+    def best_first(self, poses: Poses, start: int, end: int) -> tuple[Ints, Ints]:
+        """The poses from `start` to `end` that can be reached and lifted from, those with most samples near
+        first, and those that can be reached and not lifted from."""
         near = np.zeros(end - start, np.int64)
-        samples_near(self.compiled, poses, start, end, near, short)
-        return start + np.argsort(-near, kind="stable")[: np.count_nonzero(near)]
+        samples_near(self.compiled, poses, start, end, near)
+        order = np.argsort(-near, kind="stable")[: np.count_nonzero(near > 0)]
+        return start + order, start + np.flatnonzero(near < 0)
 
     def try_poses(
-        self, poses: Poses, rows: Ints, of_grasps: bool, stages: dict[int, int]
+        self, poses: Poses, arrays: Poses, rows: Ints, most: int, of_grasps: bool, stages: dict[int, int]
     ) -> MotionPlan | None:
-        """The plan of the first of these rows of the poses that has one; `stages` gets how far each came."""
+        """The plan of the first of these rows of the poses that has one, of at most `most` free ones.
+
+        `arrays` are the poses before they were put in memory. `stages` gets how far each came.
+        """
+        end = self.tried + most
         for k in rows.tolist():
-            row, T, opening = k if of_grasps else -1, poses.T_world_tcp[k], int(poses.opening[k])
+            if self.tried == end:
+                break
+            stage, home = try_pose(self.compiled, poses, k)
+            if stage == NOT_FREE:
+                continue
+            row, T, opening = k if of_grasps else -1, arrays.T_world_tcp[k], int(arrays.opening[k])
             self.tried += 1
-            stage, home = try_pose(self.compiled, T, opening)
             stages[k] = min(stage, SUCCESS - 1)
             self.furthest = max(self.furthest, stages[k])
             found = int(self.found[0])
             if stage == SUCCESS and self.holds(row, T, opening):
                 corners = np.stack([self.scene.robot.homes_rad[home], self.back[found, -1]])
                 path = dense(self.scene.weight, corners, self.scene.limits.step)
-                return self.plan(found, row, T, opening, home, path)
+                return self.plan(found, row, opening, home, path)
             self.without_path += [(row, T, opening)] * (found - len(self.without_path))
             if self.furthest == NO_START:
                 return None
@@ -123,34 +135,27 @@ class _Search:
             path, home, used = path_to(self.compiled, k, opening, share, self.rng)
             left -= used
             if len(path) and self.holds(row, T, opening):
-                return self.plan(k, row, T, opening, home, path)
+                return self.plan(k, row, opening, home, path)
         self.without_path, self.found[0] = [], 0
         return None
 
     def holds(self, row: int, T_world_tcp: F64, opening: int) -> bool:
         """Whether the hand holds the object at a pose; simulated on first use."""
-        around = self.scene.around
-        if row < 0:
-            is_held = self.slipped < _MOST_SLIPPED and self.score(row, T_world_tcp, opening) >= (
-                around.grasps.min_score
-            )
-            self.slipped += not is_held
-            return is_held
-        return around.grasps.holds(int(around.grasp[row]))
-
-    def score(self, row: int, T_world_tcp: F64, opening: int) -> float:
-        """Share of floating-hand pulls that hold."""
-        around = self.scene.around
+        around, grasps = self.scene.around, self.scene.around.grasps
         if row >= 0:
-            return around.grasps.score_of(int(around.grasp[row]))
+            self.score = grasps.score_of(int(around.grasp[row]))
+            return grasps.holds(int(around.grasp[row]))
+        if self.slipped >= _MOST_SLIPPED:
+            return False
+        assert grasps.pose_score is not None
         T = inverse(around.T_world_target) @ np.concatenate([T_world_tcp, [[0.0, 0.0, 0.0, 1.0]]])
-        assert around.grasps.pose_score is not None
-        return around.grasps.pose_score(T, float(around.opening_m[opening]))
+        self.score = grasps.pose_score(T, float(around.opening_m[opening]))
+        is_held = self.score >= grasps.min_score
+        self.slipped += not is_held
+        return is_held
 
-    def plan(
-        self, found: int, row: int, T_world_tcp: F64, opening: int, home: int, q_reach: F64
-    ) -> MotionPlan:
-        """The whole plan along the lines `found`."""
+    def plan(self, found: int, row: int, opening: int, home: int, q_reach: F64) -> MotionPlan:
+        """The whole plan along the lines `found`, to the pose that was last found to hold."""
         around = self.scene.around
         length, clearance_m = length_and_clearance(self.compiled, found, opening, q_reach)
         return MotionPlan(
@@ -162,7 +167,7 @@ class _Search:
             float(around.opening_m[opening]),
             length,
             clearance_m,
-            self.score(row, T_world_tcp, opening),
+            self.score,
         )
 
 
@@ -172,15 +177,16 @@ def _among_grasps(search: _Search, allowed: Bools, stages: dict[int, int]) -> Mo
     arrays, poses = around.arrays, around.poses
     if not allowed.all():
         poses = in_memory(arrays._replace(allowed=allowed))
-    short, start, end = np.full(_SHORT, -1), 0, max(around.first, _PORTION)
+    shorts, start, end = list[Ints](), 0, max(around.first, _PORTION)
     while start < len(allowed) and search.tried < most and search.furthest != NO_START:
-        rows = search.best_first(poses, start, min(end, len(allowed)), short)
-        plan = search.try_poses(arrays, rows[: most - search.tried], True, stages)
+        rows, short = search.best_first(poses, start, min(end, len(allowed)))
+        shorts.append(short)
+        plan = search.try_poses(poses, arrays, rows, most - search.tried, True, stages)
         if plan is not None:
             return plan
         start, end = end, 2 * end
     if NO_START != search.furthest < NO_LIFT:  # the others get no further than the lift
-        search.try_poses(arrays, short[short >= 0], True, stages)
+        search.try_poses(poses, arrays, np.concatenate(shorts), _SHORT, True, stages)
     return search.search_paths()
 
 
@@ -199,9 +205,10 @@ def _near_grasps(search: _Search, rows: list[int]) -> MotionPlan | None:
         each = _NEARBY // len(T)
         T, opening = np.repeat(T, each, axis=0), np.repeat(opening, each)
         near, motion = _varied(T, np.repeat(motion, each, axis=0), search.rng)
-        poses, stages = Poses.unknown(near, opening), dict[int, int]()
-        order = search.best_first(in_memory(poses), 0, len(T), np.full(0, -1))
-        plan = search.try_poses(poses, order[:_NEARBY_TRIED], False, stages) or search.search_paths()
+        arrays, stages = Poses.unknown(near, opening), dict[int, int]()
+        poses = in_memory(arrays)
+        order, _ = search.best_first(poses, 0, len(T))
+        plan = search.try_poses(poses, arrays, order, _NEARBY_TRIED, False, stages) or search.search_paths()
         if plan is not None:
             return plan
         rows = _furthest(stages)

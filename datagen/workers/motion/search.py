@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.kinematics.compiler import compiled
+from datagen.workers.kinematics.compiler import compiled, constant
 from datagen.workers.kinematics.contacts import smallest_gap_m
 from datagen.workers.kinematics.inverse import put, put_row, solve
 from datagen.workers.kinematics.tree import Ints
@@ -30,6 +30,7 @@ from datagen.workers.motion.path_search import connect, dense, shortened
 from datagen.workers.motion.reach_map import score, seeds
 
 # The order of checks of a grasp, cheap ones first. A later cause of failure means more progress.
+NOT_FREE = constant(-1)
 NO_IK, ARM_COLLISION, NO_START, NO_APPROACH, NO_LIFT, NO_PATH, SUCCESS = range(7)
 _STARTS = 3  # tucked poses from which a straight line is tried
 _CLEARANCE_POSES = 8
@@ -49,24 +50,15 @@ def _inverse_times(A: F64, B: F64, out: F64) -> None:
 
 
 @compiled
-def samples_near(s: Search, poses: Poses, start: int, end: int, near: Ints, short: Ints) -> None:
-    """Samples of the reach map near the free poses from `start` to `end`, into near (end - start,).
+def samples_near(s: Search, poses: Poses, start: int, end: int, near: Ints) -> None:
+    """Samples of the reach map near the poses from `start` to `end`, into near (end - start,).
 
-    The least of those near the pose, near its pregrasp and near the end of its lift; 0 at other poses. Poses
-    that can be reached and not lifted go to `short`, behind those that are there, while there is room.
+    The least of those near the pose, near its pregrasp and near the end of its lift; -1 where only the end of
+    the lift has none, and 0 at other poses.
     """
     # Fields are read once: each time costs more than a line of this.
-    limits, hand, room, reach, hand_work = s.limits, s.hand, s.room, s.arm.reach, s.work.hand
-    T_root, T_world, allowed, local, work = (
-        s.T_root,
-        poses.T_world_tcp,
-        poses.allowed,
-        s.work.reach.local,
-        s.work.reach,
-    )
-    pregrasp_m, lift_m, shorts = limits.pregrasp_m, limits.lift_m, 0
-    while shorts < len(short) and short[shorts] >= 0:
-        shorts += 1
+    reach, T_root, T_world, allowed = s.arm.reach, s.T_root, poses.T_world_tcp, poses.allowed
+    local, work, pregrasp_m, lift_m = s.work.reach.local, s.work.reach, s.limits.pregrasp_m, s.limits.lift_m
     for k in range(start, end):
         if not allowed[k]:
             continue
@@ -76,24 +68,30 @@ def samples_near(s: Search, poses: Poses, start: int, end: int, near: Ints, shor
             for i in range(3):
                 local[i, 3] -= pregrasp_m * local[i, 2]
             count = min(count, score(reach, local, work))
-        if count == 0 or not is_hand_free(hand, room, limits, poses, k, hand_work):
-            continue
-        for i in range(3):  # the end of the lift
-            local[i, 3] += pregrasp_m * local[i, 2] + lift_m * T_root[2, i]
-        count = min(count, score(reach, local, work))
-        near[k - start] = count
-        if count == 0 and shorts < len(short):
-            short[shorts] = k
-            shorts += 1
+        if count > 0:  # the end of the lift
+            for i in range(3):
+                local[i, 3] += pregrasp_m * local[i, 2] + lift_m * T_root[2, i]
+            count = min(count, score(reach, local, work))
+            near[k - start] = count if count > 0 else -1
 
 
 @compiled
-def try_pose(s: Search, T: F64, opening: int) -> tuple[int, int]:
-    """The furthest stage that a free pose of the hand (3, 4) leads to, and the tucked pose that it begins at.
+def try_pose(s: Search, poses: Poses, row: int) -> tuple[int, int]:
+    """The furthest stage that a pose of the hand leads to, and the tucked pose that it begins at.
 
-    Cheap checks come first. The work gets the lines of a success, and of a pose without a straight path.
+    `NOT_FREE` where the hand alone cannot get there. Cheap checks come first. The work gets the lines of a
+    success, and of a pose without a straight path.
     """
-    arm, limits, w, T_root = s.arm, s.limits, s.work, s.T_root
+    arm, limits, w, T_root, T, opening = (
+        s.arm,
+        s.limits,
+        s.work,
+        s.T_root,
+        poses.T_world_tcp[row],
+        poses.opening[row],
+    )
+    if not is_hand_free(s.hand, s.room, limits, poses, row, w.hand):
+        return NOT_FREE, -1
     tree, count, stage, ways = arm.tree, len(arm.weight), NO_IK, 0
     pregrasp, lifted, q = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, count))
     _inverse_times(T_root, T, w.reach.local)
