@@ -21,7 +21,7 @@ help:
 	@echo "make faults  the full fault campaigns, as tables"
 	@echo "make lint    the same without tests"
 	@echo "make format  rewrite the code in the project's format"
-	@echo "make docs    rewrite the pages of docs/reference that follow from the schemas"
+	@echo "make docs    rewrite the pages that follow from schemas, robots and leaderboard"
 	@echo "make pictures  draw the pictures of the documents again"
 	@echo "make site    the documents as a site with search (in build/site); dead links fail"
 	@echo "make venv    only the environment (.venv); PYTHON=python3.12 chooses another interpreter"
@@ -103,6 +103,8 @@ docs: venv
 	mv build/specification.md docs/reference/specification.md
 	$(BIN)/python -m scripts.robots_page > build/robots.md
 	mv build/robots.md docs/reference/robots.md
+	$(BIN)/python -m scripts.leaderboard_page > build/leaderboard.md
+	mv build/leaderboard.md docs/results/leaderboard.md
 
 pictures: venv
 	$(BIN)/python -m scripts.pictures
