@@ -6,8 +6,8 @@
     OUT/labels    180,000 heuristic and 20,000 plan labels as folders for the Hugging Face Hub
     OUT/SHA256SUMS, OUT/UPLOAD.md
 
-The same commit, assets and versions of libraries give the same bytes. An interrupted release continues. Labels are
-of the houses and objects in DATAGEN_ASSETS, or of the built-in ones; NUMBER=HEURISTIC,PLAN makes fewer.
+The same commit, assets and versions of libraries give the same bytes. An interrupted release continues. Labels
+are of the houses and objects in DATAGEN_ASSETS, or of the built-in ones; NUMBER=HEURISTIC,PLAN makes fewer.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ _UPLOAD = """# How to publish this release
 Check the files first: `sha256sum --check SHA256SUMS`. Each part states its licences: `labels/*/README.md`,
 `benchmark/ATTRIBUTION.md`, `model/MODEL_CARD.md`; the code is Apache-2.0.
 
-| part | where | command |
-| --- | --- | --- |
-| `dist` | a package index | `twine upload dist/*` |
-| `labels/heuristic`, `labels/plan` | Hugging Face, data sets | `hf upload OWNER/datagen-heuristic labels/heuristic . --repo-type dataset` |
-| `model` | Hugging Face, models | `hf upload OWNER/datagen-released model .` |
-| `benchmark` | the release's page | attach the files with `SHA256SUMS` |
+    twine upload dist/*                                                        # package index
+    hf upload OWNER/datagen-heuristic labels/heuristic . --repo-type dataset   # Hugging Face
+    hf upload OWNER/datagen-plan labels/plan . --repo-type dataset
+    hf upload OWNER/datagen-released model .
+
+The page of the release gets `benchmark` and `SHA256SUMS`.
 """
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tensorstore
 import xarray
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -47,6 +48,12 @@ pytestmark = pytest.mark.usefixtures("few_arrays")
 # What a store holds ---------------------------------------------------------------------------
 
 
+def in_tensorstore(path: str) -> np.ndarray:
+    """An array of a store, read by tensorstore."""
+    spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": f"{path}/"}}
+    return np.asarray(tensorstore.open(spec, read=True).result().read().result())
+
+
 def test_zarr_and_xarray_read_rows_in_order_with_dimensions_units_and_licences(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -63,6 +70,11 @@ def test_zarr_and_xarray_read_rows_in_order_with_dimensions_units_and_licences(
         data = xarray.open_zarr(f"{tmp_path}/data.zarr", chunks=None).load()
     assert_rows({str(name): data[name].values for name in data.variables}, wanted)
     for table, f in run.schema.fields:
+        if f.is_text:  # as docs/guides/read-data.md says
+            with pytest.raises(ValueError, match="data_type"):
+                in_tensorstore(f"{tmp_path}/data.zarr/{f.name}")
+        else:
+            np.testing.assert_array_equal(in_tensorstore(f"{tmp_path}/data.zarr/{f.name}"), wanted[f.name])
         assert data[f.name].dims == (table, *f.dims)
         assert (data[f.name].attrs.get("units", ""), data[f.name].attrs["long_name"]) == (f.unit, f.doc)
     keys = ["scene_index", "house_id", "sample_scene_index", "candidate_index", "robot_index"]
