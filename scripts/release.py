@@ -6,8 +6,8 @@
     OUT/labels    180,000 heuristic and 20,000 plan labels as folders for the Hugging Face Hub
     OUT/SHA256SUMS, OUT/UPLOAD.md
 
-The same commit, assets and versions of libraries give the same bytes. An interrupted release continues. Labels
-are of the houses and objects in DATAGEN_ASSETS, or of the built-in ones; NUMBER=HEURISTIC,PLAN makes fewer.
+The same commit, assets and versions of libraries give the same bytes. An interrupted release continues.
+Labels are of the houses and objects in DATAGEN_ASSETS, or of the built-in ones; NUMBER=HEURISTIC,PLAN makes fewer.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ def evaluate(
 
 
 def _refuse_bad_loop(scenes: int, execute: bool, workers: int | None, files: Sequence[Path]) -> None:
-    from datagen.configuration.specify import refuse_missing_packages
+    from datagen.configuration.robot_fields import refuse_missing_packages
 
     for option, value, least, most in (
         ("--closed-loop", scenes, 1, 10**9),

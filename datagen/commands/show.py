@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from datagen.configuration.specify import refuse_missing_packages
+from datagen.configuration.robot_fields import refuse_missing_packages
 from datagen.console.options import AS_FOUND, AssetSources, RunPath, Whole, refuse_output
 from datagen.console.printing import print_rows
 from datagen.drawing.scene_picture import Shown, draw_scene_picture

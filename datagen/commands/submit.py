@@ -9,7 +9,8 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from datagen.configuration.specify import layout_of, manifest_of, refuse_missing_packages, specify
+from datagen.configuration.robot_fields import refuse_missing_packages
+from datagen.configuration.specify import layout_of, manifest_of, specify
 from datagen.configuration.stored_scenes import (
     layout_again,
     open_stored_scenes,

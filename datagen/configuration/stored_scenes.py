@@ -8,15 +8,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from datagen.configuration.specify import (
-    complete_arm,
-    layout_of,
-    put_field,
-    read_fields,
-    refuse_unsuited,
-    robot_of,
-    validated,
-)
+from datagen.configuration.robot_fields import complete_arm, refuse_unsuited, robot_of
+from datagen.configuration.specify import layout_of, put_field, read_fields, validated
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from datagen.cluster.job_monitor import JOBS_API
 from datagen.cluster.ray_head import head_token
-from datagen.configuration.specify import refuse_missing_packages
+from datagen.configuration.robot_fields import refuse_missing_packages
 from datagen.console.command_lines import (
     absolute_path,
     absolute_robot,

@@ -9,7 +9,7 @@ import pytest
 
 from datagen import cli
 from datagen.configuration import specify as arms
-from datagen.configuration.specify import (
+from datagen.configuration.robot_fields import (
     REACH_STEP_M,
     complete_arm,
     narrow_candidates,
