@@ -7,7 +7,8 @@
     OUT/SHA256SUMS, OUT/UPLOAD.md
 
 The same commit, assets and versions of libraries give the same bytes. An interrupted release continues.
-Labels are of the houses and objects in DATAGEN_ASSETS, or of the built-in ones; NUMBER=HEURISTIC,PLAN makes fewer.
+Labels are of the houses and objects in DATAGEN_ASSETS, or of the built-in ones. NUMBER=HEURISTIC,PLAN makes
+fewer.
 """
 
 from __future__ import annotations
