@@ -51,6 +51,7 @@ def print_prediction(
     html: str | Path | None = None,
     demo: bool = False,
     goal: str | Path | None = None,
+    robot: str | None = None,
     **_: Any,
 ) -> int:
     """Print the best base pose; the exit code is 1 where no clear one has a good score."""
@@ -67,8 +68,10 @@ def print_prediction(
             written[-1] = ("goal", f"none: {goal} is not written")
         if demo:
             shown = f"--frame {sample_frame()} --map {sample_frame() / MAP}"
-            robot = f"--base-height {DEMO_BASE_HEIGHT_M} --reach {DEMO_REACH_M}"
-            written.append(("again", f"datagen predict {shown} {robot} --out answer.png"))
+            size = prediction.robot
+            ours = f"--base-height {size.base_height_m:g} --reach {size.arm_reach_m:g}"
+            ours += "" if robot is None else f" --robot {robot}"
+            written.append(("again", f"datagen predict {shown} {ours} --out answer.png"))
         print_rows(f"base poses by {prediction.scorer}", [*report_rows(prediction), *written])
     return 0 if prediction.best is not None else 1
 
@@ -224,19 +227,19 @@ def predict(given: PredictOptions) -> Prediction:
     )
     from datagen.train.prediction import predict as scored
 
+    name = given.robot or ""
+    given, yaw_rad = (given, 0.0) if given.robot is None else _of_robot(given, given.robot)
     if given.demo:
         given = replace(
             given,
             demo=False,
             frame=[sample_frame()],
             map=given.map or [sample_frame() / MAP],
-            base_height=given.base_height or DEMO_BASE_HEIGHT_M,
-            reach=given.reach or DEMO_REACH_M,
-            out=given.out or DEMO_PICTURE,
-            html=given.html or _demo_page(),
+            base_height=DEMO_BASE_HEIGHT_M if given.base_height is None else given.base_height,
+            reach=DEMO_REACH_M if given.reach is None else given.reach,
+            out=DEMO_PICTURE if given.out is None else given.out,
+            html=_demo_page() if given.html is None else given.html,
         )
-    name = given.robot or ""
-    given, yaw_rad = (given, 0.0) if given.robot is None else _of_robot(given, given.robot)
     size = (_required(given.base_height, "--base-height"), _required(given.reach, "--reach"))
     outline = None if given.footprint is None else read_footprint(given.footprint)
     error = None if given.arrival is None else read_arrival(given.arrival)

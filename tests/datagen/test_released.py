@@ -7,6 +7,7 @@ import json
 import math
 import re
 import runpy
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -24,9 +25,11 @@ from datagen.schemas.specification import PLACE_KINDS
 from datagen.train.programs import read_program
 from datagen.train.scorers import weights_sha256
 from datagen.train.training.checkpoints import load_model, read_checkpoint
+from datagen.workers.robots import robot_limits
 from scripts.release_model import card_text
 from tests.conftest import REPOSITORY
 from tests.refusals import refused
+from tests.sim_extra import needs_sim
 from tests.small_runs import json_of
 from tests.train.prediction.checkpoints import write_untrained
 from tests.train.prediction.seen_scenes import MODEL
@@ -89,6 +92,22 @@ def test_the_demonstration_answers_what_the_card_says(
     answer = json_of(capsys, ["predict", "--demo"])["best"]
     assert np.allclose([answer["x_m"], answer["y_m"]], said["base_xy_m"], atol=1e-3)
     assert math.isclose(answer["score"], said["score"], abs_tol=1e-3)
+
+
+@needs_sim
+def test_the_demonstration_is_also_of_other_robots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    answer = json_of(capsys, ["predict", "--demo", "--robot", "fetch"])
+    limits = robot_limits("fetch")
+    assert limits.base_height_m is not None
+    sizes = [answer["robot"][name] for name in ("arm_reach_m", "base_height_m")]
+    assert sizes == pytest.approx([limits.reach_m[0], limits.base_height_m[0]])
+    cli.run(["predict", "--demo", "--robot", "fetch"])
+    again = " ".join(capsys.readouterr().out.split("again")[1].split())
+    words = shlex.split(again)[1:]
+    assert json_of(capsys, words)["candidates"] == answer["candidates"]
 
 
 def test_a_frame_without_a_checkpoint_is_scored_by_the_released_model(

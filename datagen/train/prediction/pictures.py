@@ -76,6 +76,7 @@ def _draw_base(axes: Axes, prediction: Prediction, image: RgbdImage, T_world_cam
         )
         near_m = image.depth_m[row, column]
         hidden = (near_m > 0) & (near_m < points[:, 2] - _BEHIND_M)
+        hidden &= np.roll(hidden, 1) | np.roll(hidden, -1)  # one alone is a wrong pixel
         for shown, style in ((np.where(hidden, np.nan, u), "-"), (np.where(hidden, u, np.nan), ":")):
             for colour, thick in (("black", 5), (BEST.colour, 3)):
                 axes.plot(shown, v, style, color=colour, lw=thick if style == "-" else thick / 2)

@@ -58,7 +58,8 @@ def report_rows(prediction: Prediction) -> list[tuple[str, str]]:
 
 def _described(p: Prediction, row: int) -> str:
     x, y = p.base_xy_m[row]
-    return f"({x:.3f}, {y:.3f}) m, yaw {np.degrees(p.yaw_rad[row]):.1f} deg, score {p.score[row]:.3f}"
+    yaw_deg = round(float(np.degrees(p.yaw_rad[row])), 1) + 0.0  # no negative zero
+    return f"({x:.3f}, {y:.3f}) m, yaw {yaw_deg:.1f} deg, score {p.score[row]:.3f}"
 
 
 def document(prediction: Prediction) -> dict[str, Any]:
