@@ -68,10 +68,10 @@ def print_prediction(
             written[-1] = ("goal", f"none: {goal} is not written")
         if demo:
             shown = f"--frame {sample_frame()} --map {sample_frame() / MAP}"
-            size = prediction.robot
-            ours = f"--base-height {size.base_height_m:g} --reach {size.arm_reach_m:g}"
-            ours += "" if robot is None else f" --robot {robot}"
-            written.append(("again", f"datagen predict {shown} {ours} --out answer.png"))
+            own = prediction.robot
+            sizes = f"--base-height {own.base_height_m:g} --reach {own.arm_reach_m:g}"
+            named = "" if robot is None else f" --robot {robot}"
+            written.append(("again", f"datagen predict {shown} {sizes}{named} --out answer.png"))
         print_rows(f"base poses by {prediction.scorer}", [*report_rows(prediction), *written])
     return 0 if prediction.best is not None else 1
 

@@ -31,8 +31,6 @@ from datagen.workers.geometry.transforms import inverse, yaw_pose
 from datagen.workers.rendering.cloud import Cloud
 
 CROP = ObservationParams()  # of the cloud that is scored
-# The margin is to this rank: neighbours of the best have nearly its score.
-_RANK = 10
 _SURE, _LIKELY = 0.8, 0.5
 # Robots stop that far from their goals; less of the surroundings seen than this share says little.
 _LEAST_MISS_M, _LEAST_SEEN = 0.03, 0.1
@@ -123,12 +121,16 @@ class Prediction:
         return (pan + math.pi) % (2 * math.pi) - math.pi, math.atan2(T[2, 3], math.hypot(x, y))
 
     @property
-    def margin(self) -> float | None:
-        """Score of the best minus that of the 10th in its state; None where there are fewer."""
-        if self.best is None:
-            return None
-        rows = self.rows(STATES[int(self.cells.state[self.best])])
-        return float(self.score[self.best] - self.score[rows[_RANK - 1]]) if len(rows) >= _RANK else None
+    def good_share(self) -> float | None:
+        """Share of the clear base poses within the arm's reach that score good; None where there are none.
+
+        Where it is high, parking decides little: a simple rule does nearly as well.
+        """
+        rise_m = self.target.center_m[2] - self.robot.base_height_m
+        rows = self.rows("clear")
+        far_m = np.hypot(np.linalg.norm(self.cells.offset_m[rows], axis=1), rise_m)
+        near = rows[far_m <= self.robot.arm_reach_m]
+        return float((self.score[near] >= _LIKELY).mean()) if len(near) else None
 
     @cached_property
     def crop_seen(self) -> float:

@@ -13,6 +13,7 @@ from datagen.train.prediction.base_cells import STATES
 _OWN_AXES = (
     "z up, floor at z = 0, origin on the floor below the first camera; x to its right, y ahead of it, level"
 )
+_DECIDES = 0.6  # the largest share of good poses of decisive scenes
 _GIVEN_AXES = "that of the given T_world_camera; z up, floor at z = 0"
 
 
@@ -36,6 +37,9 @@ def report_rows(prediction: Prediction) -> list[tuple[str, str]]:
     if p.choice.miss_m is not None:
         rows.append(("may miss", f"by {p.choice.miss_m:.2f} m in any direction with scores that stay good"))
     rows.append(("poses", ", ".join(f"{len(p.rows(state))} {state}" for state in STATES)))
+    if p.good_share is not None:
+        decides = "parking decides here" if p.good_share < _DECIDES else "parking decides little here"
+        rows.append(("choice", f"{p.good_share:.0%} of the clear poses within reach score good: {decides}"))
     if len(unseen):
         rows.append(("unseen", f"the best is {_described(p, int(unseen[0]))}"))
     if (look := p.look_next) is not None:
@@ -79,7 +83,7 @@ def document(prediction: Prediction) -> dict[str, Any]:
         "best_unseen": None if not len(unseen) else _pose(p, int(unseen[0])),
         "arrival": None if p.arrival is None else p.arrival.text,
         "may_miss_m": p.choice.miss_m,
-        "margin_to_10th": p.margin,
+        "good_share_in_reach": p.good_share,
         "robot": robot | {"base": str(p.robot.outline)},
         "target": asdict(p.target) | pixels | {"points": p.target_points},
         "floor": {"how": floor.how, "residual_m": floor.residual_m, "doubt": floor.doubt},

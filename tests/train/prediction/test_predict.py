@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import datagen
+from datagen import released
 from datagen.schemas.specification import CandidateParams
 from datagen.train.baselines.rules import Analytic
 from datagen.train.inputs import Array, Batch
@@ -221,7 +223,7 @@ def test_unseen_base_poses_are_chosen_only_with_allow_unseen(seen: Seen, scorer:
         table, points_m=table.points_m[low], rgb=table.rgb[low], on_target=table.on_target[low], image=None
     )
     strict, lax = of(scorer, frame), of(scorer, frame, allow_unseen=True)
-    assert strict.best is None and strict.margin is None and strict.level == "none"
+    assert strict.best is None and strict.level == "none"
     assert strict.reasons[0] == "no clear base pose was observed around the target"
     assert lax.best is not None and lax.best == strict.rows("unseen")[0]
     assert lax.level == "doubtful" and any("not visible" in reason for reason in lax.reasons)
@@ -280,3 +282,21 @@ def test_the_lines_of_the_page_run(seen: Seen, tmp_path: Path, monkeypatch: pyte
     names: dict[str, object] = {}
     exec(code[1], names)
     assert isinstance(names["answer"], Prediction)
+
+
+def test_the_share_of_good_poses_is_of_clear_ones_within_reach() -> None:
+    class Nearest:
+        name, threshold = "nearest", 0.5
+
+        def score(self, batch: Batch[Array]) -> F64:
+            far_m = np.hypot(*np.asarray(batch.candidates.base_xy_m, np.float64).T)
+            return np.where(far_m < 0.7, 0.9, 0.1)
+
+    frame = released.sample_frame()
+    answer = datagen.predict(Nearest(), frame=[frame], map=[frame / released.MAP], base_height=0.7, reach=0.9)
+    rise_m = answer.center_m[2] - 0.7
+    rows = answer.rows("clear").tolist()
+    near = [k for k in rows if np.hypot(*answer.cells.offset_m[k]) ** 2 + rise_m**2 <= 0.81]
+    good = [k for k in near if answer.score[k] > 0.5]
+    assert 0 < len(good) < len(near) < len(rows) and answer.good_share == len(good) / len(near)
+    assert replace(answer, robot=replace(answer.robot, arm_reach_m=0.05)).good_share is None
