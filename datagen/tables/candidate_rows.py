@@ -108,4 +108,6 @@ def candidate_columns(part: RunPart, shard: ShardPlace, columns: Sequence[str]) 
     """
     stored, bounds = load_shard(shard, {name: part.arrays[name] for name in needed_arrays(columns)})
     rows = _Rows(part, shard, stored, np.repeat(np.arange(len(bounds) - 1), np.diff(bounds)))
-    return {name: native(DERIVED[name][1](rows) if name in DERIVED else rows.stored(name)) for name in columns}
+    return {
+        name: native(DERIVED[name][1](rows) if name in DERIVED else rows.stored(name)) for name in columns
+    }

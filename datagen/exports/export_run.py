@@ -1,0 +1,187 @@
+"""Export the scenes of a run, step by step: an interrupted export continues with its next step."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from datagen import __version__
+from datagen.console.options import AS_FOUND, AssetSources
+from datagen.exports import FORMATS
+from datagen.exports.export_record import (
+    ExportedFile,
+    ExportRecord,
+    address_from,
+    is_intact,
+    read_export,
+    refuse_other_export,
+    run_digest,
+)
+from datagen.replaying import places_of
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Rows, Run, find_scene, label_counts, open_runs
+from datagen.schemas.run_records import FileEntry
+from datagen.schemas.shard_files import described
+from datagen.schemas.shard_reading import ShardPlace, read_scene
+from datagen.schemas.storage import Storage, open_storage
+from datagen.train.run_parts import RunPart, open_parts
+from datagen.workers import registry
+
+Shard = tuple[RunPart, ShardPlace]
+# Scenes in a file of tables or clouds: 64 MiB of clouds of 4096 points.
+_SCENES_PER_FILE = 1024
+# Axes whose lengths may differ between merged runs.
+_UNEVEN = ("object", "point")
+
+
+@dataclass(frozen=True)
+class NewFile:
+    """A file that a step has made; `counts` are kept in the record for later steps."""
+
+    path: str
+    data: bytes
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Made:
+    """The files of the steps before, in order."""
+
+    storage: Storage
+    files: Sequence[ExportedFile]
+
+
+Step = Callable[[Made], Iterable[NewFile]]
+
+
+@dataclass(frozen=True, eq=False)
+class ExportSource:
+    """Scenes `first` to `past` (exclusive) of a run, counted over all merged runs."""
+
+    path: str
+    runs: Sequence[Run]
+    first: int
+    past: int
+    given: AssetSources = AS_FOUND
+    _worlds: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """Title, licences and history, as a sealed store's attributes."""
+        manifests = [run.manifest for run in self.runs]
+        return described([m.spec for m in manifests], [m.sources for m in manifests])
+
+    def shards(self, names: Sequence[str]) -> list[list[Shard]]:
+        """The shards with the named arrays, cut to these scenes, in groups for one file each."""
+        fields = {f.name: f for _, f in self.runs[0].schema.fields}
+        uneven = [n for n in names if n in fields and set(fields[n].dims) & set(_UNEVEN)]
+        groups: list[list[Shard]] = []
+        start = scenes = 0
+        for part in open_parts([self.path], names, uneven=uneven):
+            for place in part.shards:
+                low, high = max(self.first - start, 0), min(self.past - start, place.scenes)
+                start += place.scenes
+                if low >= high:
+                    continue
+                if not groups or scenes + high - low > _SCENES_PER_FILE:
+                    groups.append([])
+                    scenes = 0
+                groups[-1].append((part, _cut(place, low, high)))
+                scenes += high - low
+        return groups
+
+    def scene(self, position: int) -> tuple[Run, Any]:
+        """The run of a scene, and its rows."""
+        run, index = find_scene(self.runs, position)
+        return run, read_scene(run, index)
+
+    def rebuilt(self, run: Run, record: Mapping[str, Any]) -> Any:
+        """The geometry of a scene (`ReconstructedScene`). InputError without its houses and objects."""
+        from datagen.workers.scenes.reconstruct import reconstruct_scene
+        from datagen.workers.world import open_world
+
+        if run.storage.url not in self._worlds:
+            self._worlds.clear()  # a world is large
+            self._worlds[run.storage.url] = open_world(run.manifest.spec, *places_of(run, self.given))
+        return reconstruct_scene(self._worlds[run.storage.url], record)
+
+
+def _cut(place: ShardPlace, low: int, high: int) -> ShardPlace:
+    """A shard's wanted scenes `low` to `high`."""
+    each, rows = place.full_samples // place.full_scenes, place.rows
+    samples = min(high * each, rows.samples) - low * each
+    return replace(place, rows=Rows(rows.first + low, high - low, samples))
+
+
+def scene_key(run_hash: str, scene_index: int) -> str:
+    """Name of a scene in every export: 12 digits of its specification's hash, and its index."""
+    return f"{run_hash[:12]}-{scene_index:06d}"
+
+
+def open_source(run: str, scenes: str | None, given: AssetSources) -> ExportSource:
+    """The scenes `FIRST:PAST` [all] of a run. InputError where it is incomplete or has no such scenes."""
+    runs = open_runs(run)
+    counts = label_counts(runs)
+    if counts.labels < counts.n:
+        problem = f"{counts.n - counts.labels:,} of the {counts.n:,} planned samples are missing"
+        raise InputError(run, "commits", problem, f"Make them with `datagen resume {run}`")
+    total = sum(len(each.counted(each.n)) for each in runs)
+    if scenes is None:
+        return ExportSource(run, runs, 0, total, given)
+    found = re.fullmatch(r"([0-9]{1,15})(?::([0-9]{1,15}))?", scenes)
+    first, past = (int(found[1]), int(found[2] or int(found[1]) + 1)) if found else (0, 0)
+    if not first < past <= total:
+        fix = f"Give one from 0 to {total - 1}, or FIRST:PAST, as 0:{total}"
+        raise InputError("--scenes", scenes[:40], f"is not a range of the run's {total} scenes", fix)
+    return ExportSource(run, runs, first, past, given)
+
+
+def export_run(
+    source: ExportSource, to: str, out: str | Path, seen: Callable[[int, int], None] | None = None
+) -> tuple[Storage, ExportRecord]:
+    """Write the files of an export; those that a former call has written are kept where they are intact.
+
+    `seen` is told the steps that are done, of all. InputError for an unknown format, for a folder with other
+    files or another export, and for scenes that cannot be read.
+    """
+    steps: Sequence[Step] = registry.entry(FORMATS, to, "--to")(source)
+    about, run = source.about, open_storage(source.path, probe=False, create=False)
+    storage = open_storage(out, probe=False)
+    wanted = ExportRecord(
+        format=to,
+        version=__version__,
+        run=address_from(run, storage),
+        run_sha256=run_digest(source.runs),
+        spec_hashes=tuple(each.manifest.spec_hash for each in source.runs),
+        scenes=(source.first, source.past),
+        license=about["license"],
+        acknowledgement=about["acknowledgement"],
+    )
+    if (found := read_export(storage)) is not None:
+        refuse_other_export(storage, found, wanted)
+    elif (file := next(iter(storage.list("")), None)) is not None:
+        raise InputError(storage.url, file.key, "is not of an export", "Choose a new --out")
+    record = wanted if found is None else wanted.model_copy(update={"files": found.files})
+    record.write(storage)
+    for number, step in enumerate(steps):
+        kept = [file for file in record.files if file.step == number]
+        if not kept or not all(is_intact(storage, file) for file in kept):
+            before = [file for file in record.files if file.step < number]
+            new = [_write(storage, number, file) for file in step(Made(storage, before))]
+            after = [file for file in record.files if file.step > number]
+            record = record.model_copy(update={"files": (*before, *new, *after)})
+            record.write(storage)
+        if seen is not None:
+            seen(number + 1, len(steps))
+    record = record.model_copy(update={"complete": True})
+    record.write(storage)
+    return storage, record
+
+
+def _write(storage: Storage, number: int, file: NewFile) -> ExportedFile:
+    storage.put(file.path, file.data)
+    entry = FileEntry.of(file.path, file.data)
+    return ExportedFile(**entry.model_dump(), step=number, counts=dict(file.counts))
