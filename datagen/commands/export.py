@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import KW_ONLY, dataclass
 from typing import Annotated, Any
 
-from cyclopts import Parameter
-
 from datagen.console.command_lines import options_of, prints
 from datagen.console.options import RUN, AsJson, AssetSources, PathOrAddress
 from datagen.console.printing import counted, print_json, print_rows, size

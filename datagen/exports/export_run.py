@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +24,18 @@ from datagen.exports.export_record import (
 )
 from datagen.replaying import places_of
 from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SceneRows
 from datagen.schemas.run import Rows, Run, find_scene, label_counts, open_runs
 from datagen.schemas.run_records import FileEntry
 from datagen.schemas.shard_files import described
-from datagen.schemas.shard_reading import ShardPlace, read_scene
+from datagen.schemas.shard_reading import ShardPlace, read_scenes
 from datagen.schemas.storage import Storage, open_storage
 from datagen.train.run_parts import RunPart, open_parts
 from datagen.workers import registry
 
 Shard = tuple[RunPart, ShardPlace]
 # Scenes in a file of tables or clouds: 64 MiB of clouds of 4096 points.
-_SCENES_PER_FILE = 1024
+SCENES_PER_FILE = 1024
 # Axes whose lengths may differ between merged runs.
 _UNEVEN = ("object", "point")
 
@@ -86,17 +89,29 @@ class ExportSource:
                 start += place.scenes
                 if low >= high:
                     continue
-                if not groups or scenes + high - low > _SCENES_PER_FILE:
+                if not groups or scenes + high - low > SCENES_PER_FILE:
                     groups.append([])
                     scenes = 0
                 groups[-1].append((part, _cut(place, low, high)))
                 scenes += high - low
         return groups
 
-    def scene(self, position: int) -> tuple[Run, Any]:
-        """The run of a scene, and its rows."""
-        run, index = find_scene(self.runs, position)
-        return run, read_scene(run, index)
+    def scenes(self, first: int, past: int) -> Iterator[tuple[Run, SceneRows]]:
+        """Each scene's run and rows, in order: its record, and those of its candidates that count."""
+        found = (find_scene(self.runs, position) for position in range(first, past))
+        for run, group in groupby(found, lambda one: one[0]):
+            each, n, indices = run.layout.candidates_per_scene, run.n, [index for _, index in group]
+            for index, rows in zip(indices, read_scenes(run, indices), strict=True):
+                samples = {name: values[: n - index * each] for name, values in rows.samples.items()}
+                yield run, SceneRows(rows.record, samples)
+
+    def each_scene(self, file: Callable[[Run, SceneRows], Iterable[NewFile]]) -> list[Step]:
+        """A step for each scene, which makes files of it."""
+
+        def step(position: int, _: Made) -> Iterable[NewFile]:
+            return file(*next(self.scenes(position, position + 1)))
+
+        return [partial(step, position) for position in range(self.first, self.past)]
 
     def rebuilt(self, run: Run, record: Mapping[str, Any]) -> Any:
         """The geometry of a scene (`ReconstructedScene`). InputError without its houses and objects."""

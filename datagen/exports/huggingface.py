@@ -127,9 +127,8 @@ def _card(
         "",
         about["summary"],
         "",
-        "The table `candidates` has one row per candidate base pose, joined with its scene. The table `scenes` "
-        "has one row per scene, with its point cloud; `scene_id` joins them. Houses are split into train, "
-        "validation and test.",
+        "The table `candidates` has one row per candidate base pose, joined with its scene; `scenes` has one "
+        "row per scene, with its point cloud. `scene_id` joins them. Each house is in one split.",
         "",
         "## Licences",
         "",
