@@ -16,6 +16,7 @@ from datagen.tables.candidate_rows import DEFAULT, Array, candidate_columns, nee
 from datagen.train.reader import JOIN_FIELDS, native
 from datagen.workers.houses import split_of
 
+# Arrow's own types are unknown to type checkers: batches and schemas are Any here.
 # Columns of a cloud's points; rows without a point are left out.
 CLOUD = ("points_m", "rgb", "target_mask")
 _SPLIT = Field("split", "string", (), "", "", "side of the split of houses: train, val or test")
@@ -59,7 +60,7 @@ def candidate_shards(source: ExportSource) -> list[list[Shard]]:
     return source.shards(needed_arrays([f.name for f in candidate_fields(source) if f is not _SCENE_ID]))
 
 
-def candidate_batch(shard: Shard, fields: Sequence[Field]) -> pa.RecordBatch:
+def candidate_batch(shard: Shard, fields: Sequence[Field]) -> Any:
     """One row for each candidate of a shard."""
     names = [field.name for field in fields if field is not _SCENE_ID]
     columns = candidate_columns(*shard, names)
@@ -77,7 +78,7 @@ def scene_shards(source: ExportSource) -> list[list[Shard]]:
     return source.shards([*JOIN_FIELDS, *(field.name for field in scene_fields(source)[2:])])
 
 
-def scene_batch(shard: Shard, fields: Sequence[Field]) -> pa.RecordBatch:
+def scene_batch(shard: Shard, fields: Sequence[Field]) -> Any:
     """One row for each scene of a shard; clouds have their points alone."""
     part, place = shard
     columns: dict[str, Any] = dict(place.read(part.arrays[field.name] for field in fields[2:]))
@@ -90,7 +91,7 @@ def scene_batch(shard: Shard, fields: Sequence[Field]) -> pa.RecordBatch:
 
 
 def parquet_of(
-    fields: Sequence[Field], batches: Iterable[pa.RecordBatch], source: ExportSource
+    fields: Sequence[Field], batches: Iterable[Any], source: ExportSource
 ) -> tuple[bytes, dict[str, int]]:
     """The bytes of a Parquet file, and its numbers of rows and of bytes in memory.
 
@@ -106,9 +107,9 @@ def parquet_of(
     return sink.getvalue().to_pybytes(), {"rows": rows, "bytes": size}
 
 
-def _row_groups(batches: Iterable[pa.RecordBatch]) -> Iterator[list[pa.RecordBatch]]:
+def _row_groups(batches: Iterable[Any]) -> Iterator[list[Any]]:
     """The batches with rows, several together where they are small."""
-    group: list[pa.RecordBatch] = []
+    group: list[Any] = []
     for batch in batches:
         group += [batch] if batch.num_rows else []
         if sum(b.num_rows for b in group) >= _GROUP_ROWS or sum(b.nbytes for b in group) >= _GROUP_BYTES:
@@ -118,7 +119,7 @@ def _row_groups(batches: Iterable[pa.RecordBatch]) -> Iterator[list[pa.RecordBat
         yield group
 
 
-def arrow_schema(fields: Sequence[Field]) -> pa.Schema:
+def arrow_schema(fields: Sequence[Field]) -> Any:
     """The columns with their types and, as metadata, description, unit and frame."""
     return pa.schema(
         [
@@ -151,7 +152,7 @@ def _scene_ids(shard: Shard, scene_index: Array) -> Array:
     return np.array([scene_key(spec_hash, index) for index in scene_index.tolist()], object)
 
 
-def _batch(fields: Sequence[Field], columns: dict[str, Any]) -> pa.RecordBatch:
+def _batch(fields: Sequence[Field], columns: dict[str, Any]) -> Any:
     arrays = [_arrow_array(field, columns[field.name]) for field in fields]
     return pa.RecordBatch.from_arrays(arrays, schema=arrow_schema(fields))
 

@@ -9,13 +9,13 @@ from typing import Any
 from datagen.exports.export_record import ExportedFile
 from datagen.schemas.fields import Field
 
+# The standard's own context; readers warn of another one.
 _TERMS = (
-    *("citeAs", "column", "equivalentProperty", "extract", "field", "fileObject", "fileProperty", "fileSet"),
-    *("format", "includes", "isLiveDataset", "jsonPath", "key", "md5", "parentField", "path", "recordSet"),
-    *("references", "regex", "repeated", "replace", "samplingRate", "separator", "source", "subField"),
-    "transform",
+    "citeAs column equivalentProperty extract field fileObject fileProperty fileSet format includes "
+    "isLiveDataset jsonPath key md5 parentField path recordSet references regex repeated replace "
+    "samplingRate separator source subField transform"
 )
-_CONTEXT = {term: f"cr:{term}" for term in _TERMS} | {
+_CONTEXT = {term: f"cr:{term}" for term in _TERMS.split()} | {
     "@language": "en",
     "@vocab": "https://schema.org/",
     "conformsTo": "dct:conformsTo",
@@ -27,7 +27,7 @@ _CONTEXT = {term: f"cr:{term}" for term in _TERMS} | {
     "rai": "http://mlcommons.org/croissant/RAI/",
     "sc": "https://schema.org/",
 }
-_TYPES = {"s": "sc:Text", "b": "sc:Boolean", "i": "sc:Integer", "u": "sc:Integer", "f": "sc:Float"}
+_TYPES = {"s": "Text", "b": "Boolean", "i": "Integer", "u": "Integer", "f": "Float"}
 
 
 def croissant(
@@ -42,26 +42,14 @@ def croissant(
     `tables` have, by the name of their folder, columns of one value a row with their types; `files` are those
     in these folders.
     """
-    distribution: list[dict[str, Any]] = [
-        {
-            "@type": "cr:FileObject",
-            "@id": file.path,
-            "name": file.path.replace("/", "-"),
-            "contentUrl": file.path,
-            "contentSize": f"{file.size} B",
-            "encodingFormat": "application/x-parquet",
-            "sha256": file.sha256,
-        }
+    parquet = {"encodingFormat": "application/x-parquet"}
+    objects = [
+        {"@type": "cr:FileObject", "@id": file.path, "name": file.path.replace("/", "-"), **parquet}
+        | {"contentUrl": file.path, "contentSize": f"{file.size} B", "sha256": file.sha256}
         for file in files
     ]
-    distribution += [
-        {
-            "@type": "cr:FileSet",
-            "@id": table,
-            "name": table,
-            "encodingFormat": "application/x-parquet",
-            "includes": f"{table}/*.parquet",
-        }
+    sets = [
+        {"@type": "cr:FileSet", "@id": table, "name": table, "includes": f"{table}/*.parquet", **parquet}
         for table in tables
     ]
     document = {
@@ -75,26 +63,19 @@ def croissant(
         "creator": {"@type": "sc:Organization", "name": "datagen"},
         "datePublished": created[:10],
         "version": "1.0.0",
-        "distribution": distribution,
+        "distribution": [*objects, *sets],
         "recordSet": [_records(table, fields) for table, fields in tables.items()],
     }
     return json.dumps(document, indent=1).encode() + b"\n"
 
 
 def _records(table: str, fields: Sequence[tuple[Field, str]]) -> dict[str, Any]:
-    return {
-        "@type": "cr:RecordSet",
-        "@id": f"{table}-records",
-        "name": f"{table}-records",
-        "field": [
-            {
-                "@type": "cr:Field",
-                "@id": f"{table}-records/{field.name}",
-                "name": field.name,
-                "description": f"{field.doc} ({field.unit})" if field.unit not in ("", "1") else field.doc,
-                "dataType": _TYPES[dtype[0]],
-                "source": {"fileSet": {"@id": table}, "extract": {"column": field.name}},
-            }
-            for field, dtype in fields
-        ],
-    }
+    name = f"{table}-records"
+    columns = [
+        {"@type": "cr:Field", "@id": f"{name}/{field.name}", "name": field.name}
+        | {"description": f"{field.doc} ({field.unit})" if field.unit not in ("", "1") else field.doc}
+        | {"dataType": f"sc:{_TYPES[dtype[0]]}"}
+        | {"source": {"fileSet": {"@id": table}, "extract": {"column": field.name}}}
+        for field, dtype in fields
+    ]
+    return {"@type": "cr:RecordSet", "@id": name, "name": name, "field": columns}

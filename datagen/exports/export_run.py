@@ -56,6 +56,10 @@ class Made:
     storage: Storage
     files: Sequence[ExportedFile]
 
+    def sums(self, *counts: str) -> list[int]:
+        """Sums of counts over all files."""
+        return [sum(file.counts.get(name, 0) for file in self.files) for name in counts]
+
 
 Step = Callable[[Made], Iterable[NewFile]]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -34,8 +35,8 @@ def steps(source: ExportSource) -> Sequence[Step]:
         for name, mesh, T in bodies:
             made.add_geometry(_geometry(mesh), name, name, transform=_T_GLTF_WORLD @ T)
         made.metadata.update({key: source.about[key] for key in ("license", "acknowledgement")})
-        data = made.export(file_type="glb")
-        yield NewFile(f"{scene_key(run.manifest.spec_hash, scene.index)}.glb", bytes(data))
+        data: Any = made.export(file_type="glb")
+        yield NewFile(f"{scene_key(run.manifest.spec_hash, scene.index)}.glb", data)
 
     return source.each_scene(file)
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.compute as pc
+import numpy as np
 
 from datagen.exports.arrow_tables import (
     candidate_batch,
@@ -32,30 +31,25 @@ _TABLES = {
     "candidates": (candidate_fields, candidate_shards, candidate_batch),
     "scenes": (scene_fields, scene_shards, scene_batch),
 }
-_SIZES = (
-    (10**3, "n<1K"),
-    (10**4, "1K<n<10K"),
-    (10**5, "10K<n<100K"),
-    (10**6, "100K<n<1M"),
-    (10**7, "1M<n<10M"),
-)
-# The Hub's licences that datagen's sources have; it has no others' names.
+_SIZES = {10**3: "n<1K", 10**4: "1K<n<10K", 10**5: "10K<n<100K", 10**6: "100K<n<1M", 10**7: "1M<n<10M"}
+# Licences that the Hub has a name for: their own in lower case.
 _LICENCES = ("apache-2.0", "cc-by-4.0", "cc-by-nc-4.0", "cc-by-sa-4.0", "cc0-1.0", "mit", "bsd-3-clause")
 
 
 def steps(source: ExportSource) -> Sequence[Step]:
     """Tables `candidates` and `scenes` by split of their houses, then card and description."""
-    made: list[Step] = []
-    for table, (_, shards_of, _) in _TABLES.items():
-        for number, shards in enumerate(shards_of(source)):
-            made.append(partial(_table, source, table, number, shards))
+    made: list[Step] = [
+        partial(_table, source, table, number, shards)
+        for table, (_, shards_of, _) in _TABLES.items()
+        for number, shards in enumerate(shards_of(source))
+    ]
     return [*made, partial(_documents, source)]
 
 
 def _table(
     source: ExportSource, table: str, number: int, shards: Sequence[Shard], _: Made
 ) -> Iterator[NewFile]:
-    fields_of, _, batch_of = _TABLES[table]
+    fields_of, _shards, batch_of = _TABLES[table]
     fields = fields_of(source)
     for ours, theirs in _SPLITS.items():
         batches = (_of_split(batch_of(shard, fields), ours) for shard in shards)
@@ -64,90 +58,75 @@ def _table(
             yield NewFile(f"{table}/{theirs}-{number:05d}.parquet", data, counts)
 
 
-def _of_split(batch: pa.RecordBatch, split: str) -> pa.RecordBatch:
-    return batch.filter(pc.equal(batch.column("split"), split))
+def _of_split(batch: Any, split: str) -> Any:
+    return batch.take(np.flatnonzero(np.array(batch.column("split").to_pylist()) == split))
 
 
 def _documents(source: ExportSource, made: Made) -> Iterator[NewFile]:
     manifests = [run.manifest for run in source.runs]
-    found = (asset for m in manifests for asset in assets_of(m.spec, m.sources))
-    assets = list(dict.fromkeys(found))
+    assets = list(dict.fromkeys(asset for m in manifests for asset in assets_of(m.spec, m.sources)))
     fields = {table: fields_of(source) for table, (fields_of, _, _) in _TABLES.items()}
-    yield NewFile("README.md", _card(source, assets, fields, made.files).encode())
-    single = {
-        table: [(field, dtype_of(field)) for field in columns if not field.dims]
-        for table, columns in fields.items()
-    }
-    licences = dict.fromkeys(asset.licence for asset in assets)
-    yield NewFile(
-        "croissant.json",
-        croissant(source.about, list(licences), manifests[0].created, single, made.files),
-    )
+    text = "\n".join([*_head(source, assets, fields, made.files), *_body(source, assets, fields)])
+    yield NewFile("README.md", f"{text}\n".encode())
+    single = {name: [(f, dtype_of(f)) for f in columns if not f.dims] for name, columns in fields.items()}
+    licences = list(dict.fromkeys(asset.licence for asset in assets))
+    data = croissant(source.about, licences, manifests[0].created, single, made.files)
+    yield NewFile("croissant.json", data)
 
 
-def _card(
+def _head(
     source: ExportSource,
     assets: Sequence[Asset],
-    fields: dict[str, Sequence[Field]],
+    fields: Mapping[str, Sequence[Field]],
     files: Sequence[ExportedFile],
-) -> str:
-    about = source.about
+) -> Iterator[str]:
+    """The card's lines of YAML."""
     rows = sum(file.counts["rows"] for file in files if file.path.startswith("candidates/"))
-    head = [
-        "---",
-        f"license: {json.dumps(_hub_licences(assets))}",
-        f"pretty_name: {json.dumps(about['title'])}",
-        f"size_categories: [{next((name for most, name in _SIZES if rows < most), 'n>10M')}]",
-        "task_categories: [robotics]",
-        "tags: [robotics, mobile-manipulation, base-placement, point-cloud, datagen]",
-        "configs:",
-    ]
+    yield from ("---", f"license: {json.dumps(_hub_licences(assets))}")
+    yield f"pretty_name: {json.dumps(source.about['title'])}"
+    yield f"size_categories: [{next((name for most, name in _SIZES.items() if rows < most), 'n>10M')}]"
+    yield "task_categories: [robotics]"
+    yield "tags: [robotics, mobile-manipulation, base-placement, point-cloud, datagen]"
+    yield "configs:"
     for table in fields:
-        head += [f"- config_name: {table}", *["  default: true"] * (table == "candidates"), "  data_files:"]
+        default = f"  default: {'true' if table == 'candidates' else 'false'}"
+        yield from (f"- config_name: {table}", default, "  data_files:")
         for split, _ in _splits(table, files):
-            head += [f"  - split: {split}", f"    path: {table}/{split}-*.parquet"]
-    head.append("dataset_info:")
+            yield from (f"  - split: {split}", f"    path: {table}/{split}-*.parquet")
+    yield "dataset_info:"
     for table, columns in fields.items():
-        head += [f"- config_name: {table}", "  features:"]
+        yield from (f"- config_name: {table}", "  features:")
         for field in columns:
-            head += [f"  - name: {field.name}", *_feature(field)]
-        head.append("  splits:")
+            nested = [f"    {'  ' * depth}list:" for depth in range(len(field.dims) - 1)]
+            last = f"{'list' if field.dims else 'dtype'}: {dtype_of(field)}"
+            yield from (f"  - name: {field.name}", *nested, f"    {'  ' * len(nested)}{last}")
+        yield "  splits:"
         parts = _splits(table, files)
         for split, mine in parts:
-            total = {key: sum(file.counts[key] for file in mine) for key in ("bytes", "rows")}
-            head += [f"  - name: {split}", f"    num_bytes: {total['bytes']}"]
-            head += [f"    num_examples: {total['rows']}"]
+            yield from (f"  - name: {split}", f"    num_bytes: {sum(file.counts['bytes'] for file in mine)}")
+            yield f"    num_examples: {sum(file.counts['rows'] for file in mine)}"
         every = [file for _, mine in parts for file in mine]
-        head += [f"  download_size: {sum(file.size for file in every)}"]
-        head += [f"  dataset_size: {sum(file.counts['bytes'] for file in every)}"]
-    body = [
-        "---",
-        "",
-        f"# {about['title']}",
-        "",
-        about["summary"],
-        "",
+        yield f"  download_size: {sum(file.size for file in every)}"
+        yield f"  dataset_size: {sum(file.counts['bytes'] for file in every)}"
+    yield "---"
+
+
+def _body(
+    source: ExportSource, assets: Sequence[Asset], fields: Mapping[str, Sequence[Field]]
+) -> Iterator[str]:
+    about = source.about
+    yield from ("", f"# {about['title']}", "", about["summary"], "")
+    yield (
         "The table `candidates` has one row per candidate base pose, joined with its scene; `scenes` has one "
-        "row per scene, with its point cloud. `scene_id` joins them. Each house is in one split.",
-        "",
-        "## Licences",
-        "",
-        *(f"- {asset.name}: {asset.licence} ({asset.reference})" for asset in assets),
-        "",
-        "## How it was made",
-        "",
-        *(f"- `{line}`" for line in about["history"].split("\n")),
-    ]
+        "row per scene, with its point cloud. `scene_id` joins them. Each house is in one split."
+    )
+    yield from ("", "## Licences", "")
+    yield from (f"- {asset.name}: {asset.licence} ({asset.reference})" for asset in assets)
+    yield from ("", "## How it was made", "", *(f"- `{line}`" for line in about["history"].split("\n")))
     for table, columns in fields.items():
-        body += [
-            "",
-            f"## Columns of {table}",
-            "",
-            "| column | unit | frame | content |",
-            "| --- | --- | --- | --- |",
-        ]
-        body += [f"| `{f.name}` | {f.unit} | {f.frame} | {f.doc.replace('|', '/')} |" for f in columns]
-    return "\n".join([*head, *body]) + "\n"
+        yield from ("", f"## Columns of {table}", "", "| column | unit | frame | content |")
+        yield "| --- | --- | --- | --- |"
+        yield from (f"| `{f.name}` | {f.unit} | {f.frame} | {f.doc.replace('|', '/')} |" for f in columns)
 
 
 def _splits(table: str, files: Sequence[ExportedFile]) -> list[tuple[str, list[ExportedFile]]]:
@@ -156,19 +135,8 @@ def _splits(table: str, files: Sequence[ExportedFile]) -> list[tuple[str, list[E
     return [(split, mine) for split, mine in found.items() if mine]
 
 
-def _feature(field: Field) -> list[str]:
-    """A column's type in the card, after its name."""
-    lines, indent = list[str](), "    "
-    for _ in field.dims[:-1]:
-        lines.append(f"{indent}list:")
-        indent += "  "
-    return [*lines, f"{indent}{'list' if field.dims else 'dtype'}: {dtype_of(field)}"]
-
-
-def _hub_licences(assets: Iterable[Asset]) -> list[str]:
+def _hub_licences(assets: Sequence[Asset]) -> list[str]:
     """The Hub's names of the licences: "unknown" where none is stated, "other" for those without a name."""
-    names: dict[str, Any] = {}
-    for asset in assets:
-        name = asset.licence.lower()
-        names["unknown" if name == "not stated" else name if name in _LICENCES else "other"] = None
-    return list(names)
+    names = [asset.licence.lower() for asset in assets]
+    known = [n if n in _LICENCES else "unknown" if n == "not stated" else "other" for n in names]
+    return list(dict.fromkeys(known))

@@ -1,4 +1,4 @@
-"""Scenes as recordings of Rerun: house, objects, cloud, camera, candidates, and the best trial of `sim` runs."""
+"""Scenes as recordings of Rerun: house, objects, cloud, camera, candidates, and the best trial."""
 
 from __future__ import annotations
 

@@ -77,5 +77,5 @@ def _joined(name: str, parts: Sequence[Array]) -> Any:
     values = np.concatenate(parts)
     if name in MEANINGS:
         codes = np.where(np.isnan(values), -1, values).astype(np.int8)
-        return pandas.Categorical.from_codes(codes, categories=list(MEANINGS[name]))
+        return pandas.Categorical.from_codes(codes, dtype=pandas.CategoricalDtype(list(MEANINGS[name])))
     return pandas.Categorical(values) if values.dtype.kind == "O" else values
