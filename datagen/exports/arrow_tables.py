@@ -138,9 +138,13 @@ def dtype_of(field: Field) -> str:
     return "string" if field.codes else {"float16": "float32"}.get(field.dtype, field.dtype)
 
 
-def _arrow_type(field: Field) -> Any:
+def _leaf_type(field: Field) -> Any:
     name = dtype_of(field)
-    found = pa.string() if name == "string" else pa.from_numpy_dtype(np.dtype(name))
+    return pa.string() if name == "string" else pa.from_numpy_dtype(np.dtype(name))
+
+
+def _arrow_type(field: Field) -> Any:
+    found = _leaf_type(field)
     for _ in field.dims:
         found = pa.list_(found)
     return found
@@ -159,17 +163,14 @@ def _batch(fields: Sequence[Field], columns: dict[str, Any]) -> Any:
 
 def _arrow_array(field: Field, values: Any) -> Any:
     if isinstance(values, list):  # arrays of different lengths
-        lengths = [len(one) for one in values]
-        inner = _nested(np.concatenate(values))
-        return pa.ListArray.from_arrays(np.cumsum([0, *lengths], dtype=np.int32), inner)
-    if field.codes:
-        values = np.array(field.codes, object)[values]
-    return _nested(values)
+        ends = np.cumsum([0, *map(len, values)], dtype=np.int32)
+        return pa.ListArray.from_arrays(ends, _nested(field, np.concatenate(values)))
+    return _nested(field, np.array(field.codes, object)[values] if field.codes else values)
 
 
-def _nested(values: Array) -> Any:
+def _nested(field: Field, values: Array) -> Any:
     """Rows of any shape as (lists of) values."""
-    found = pa.array(values.reshape(-1))
+    found = pa.array(values.reshape(-1), _leaf_type(field))
     for size in reversed(values.shape[1:]):
         found = pa.ListArray.from_arrays(np.arange(0, len(found) + 1, size, dtype=np.int32), found)
     return found

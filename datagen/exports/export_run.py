@@ -22,7 +22,6 @@ from datagen.exports.export_record import (
     refuse_other_export,
     run_digest,
 )
-from datagen.replaying import places_of
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.run import Rows, Run, find_scene, label_counts, open_runs
@@ -119,6 +118,8 @@ class ExportSource:
 
     def rebuilt(self, run: Run, record: Mapping[str, Any]) -> Any:
         """The geometry of a scene (`ReconstructedScene`). InputError without its houses and objects."""
+        # Imported here: tables need none of the libraries of scenes.
+        from datagen.replaying import places_of
         from datagen.workers.scenes.reconstruct import reconstruct_scene
         from datagen.workers.world import open_world
 
