@@ -334,13 +334,16 @@ def cf_attributes(field: Field, table: Table) -> dict[str, Any]:
 
 
 def assets_of(spec: Specification, known: Mapping[str, str]) -> list[Asset]:
-    """Houses, objects and, for an arm, robots."""
+    """Houses, objects and, for an arm, robots; other packages' robots and files state no licence."""
     found: list[Asset] = []
     for what, source in (("houses", spec.houses), ("objects", spec.objects)):
         title = known.get(f"{what}_title", f"{what} read as {source.kind}")
         told = (known.get(f"{what}_{key}", _NOT_STATED) for key in ("licence", "attribution"))
         found.append(_BUILTIN[what] if source.kind == "builtin" else Asset(title, *told))
-    return found if spec.arm is None else [*found, _ROBOTS]
+    if spec.arm is None:
+        return found
+    own = Asset(f"robot {spec.arm.robot}", _NOT_STATED, _NOT_STATED)
+    return [*found, _ROBOTS if spec.arm.robot_digest is None else own]
 
 
 def _source(spec: Specification) -> str:
