@@ -14,12 +14,9 @@ from datagen.exports.export_run import export_run, open_source
 
 def print_export(report: dict[str, Any], json: bool, **_: Any) -> int:
     """Print the report of an export."""
-    if json:
-        print_json(report)
-    else:
-        files = f"{counted(report['files'], 'file')}, {size(report['bytes'])}"
-        rows = [("scenes", f"{report['scenes']:,}"), ("files", files), ("licences", report["license"])]
-        print_rows(f"{report['format']}: {report['out']}", rows)
+    files = f"{counted(report['files'], 'file')}, {size(report['bytes'])}"
+    rows = [("scenes", f"{report['scenes']:,}"), ("files", files), ("licences", report["license"])]
+    print_json(report) if json else print_rows(f"{report['format']}: {report['out']}", rows)
     return 0
 
 
@@ -66,12 +63,6 @@ def export(given: ExportOptions) -> dict[str, Any]:
     source = open_source(str(given.run), given.scenes, given)
     with counting("steps", as_json=given.json) as seen:
         storage, record = export_run(source, given.to, given.out, seen)
-    return {
-        "format": record.format,
-        "out": storage.url,
-        "scenes": source.past - source.first,
-        "files": len(record.files),
-        "bytes": sum(file.size for file in record.files),
-        "license": record.license,
-        "acknowledgement": record.acknowledgement,
-    }
+    sizes = {"files": len(record.files), "bytes": sum(file.size for file in record.files)}
+    stated = {name: getattr(record, name) for name in ("format", "license", "acknowledgement")}
+    return {"out": storage.url, "scenes": source.past - source.first, **sizes, **stated}

@@ -83,16 +83,13 @@ def verify(
 
 
 def _verify_export(storage: Storage, record: ExportRecord, json: bool) -> int:
-    found = list(check_export(storage, record))
-    files = counted(len(record.files), "file")
-    state = f"clean: {storage.url} is the {record.format} export of {record.run} ({files}, every byte)"
+    found = [{"file": file, "problem": problem} for file, problem in check_export(storage, record)]
+    files = f"{counted(len(record.files), 'file')}, every byte"
+    clean = f"clean: {storage.url} is the {record.format} export of {record.run} ({files})"
     if json:
-        findings = [{"file": file, "problem": problem} for file, problem in found]
-        print_json({"export": storage.url, "run": record.run, "clean": not found, "findings": findings})
-    elif not found:
-        print_lines(state)
-    for file, problem in found if not json else ():
-        print_lines(f"{file}: {problem}")
+        print_json({"export": storage.url, "run": record.run, "clean": not found, "findings": found})
+    else:
+        print_lines("\n".join("{file}: {problem}".format(**each) for each in found) or clean)
     return 1 if found else 0
 
 

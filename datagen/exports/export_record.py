@@ -16,7 +16,7 @@ from datagen.schemas.run_records import MAX_FILE_BYTES, Digest, FileEntry, Store
 from datagen.schemas.storage import Storage
 
 EXPORT = "export.json"
-_AGAIN = "Export again into a new --out"
+_AGAIN, _SAME = "Export again into a new --out", "Run the same `datagen export` again"
 
 
 class ExportedFile(FileEntry):
@@ -27,7 +27,7 @@ class ExportedFile(FileEntry):
 
 
 class ExportRecord(StoredRecord):
-    """export.json, rewritten after each step; equal runs and options give equal bytes."""
+    """export.json, rewritten as steps are done; equal runs and options give equal bytes."""
 
     format: str
     version: str  # of datagen
@@ -61,9 +61,7 @@ def run_digest(runs: Sequence[Run]) -> str:
 
 def address_from(run: Storage, out: Storage) -> str:
     """The address of a run as its export's record has it."""
-    if run.folder is None or out.folder is None:
-        return run.url
-    return os.path.relpath(run.folder, out.folder)
+    return run.url if run.folder is None or out.folder is None else os.path.relpath(run.folder, out.folder)
 
 
 def is_intact(storage: Storage, file: FileEntry) -> bool:
@@ -83,10 +81,10 @@ def check_export(storage: Storage, record: ExportRecord) -> Iterator[tuple[str, 
     InputError where the run is not at its address.
     """
     if not record.complete:
-        yield EXPORT, "the export was interrupted. Run the same `datagen export` again"
+        yield EXPORT, f"the export was interrupted. {_SAME}"
     for file in record.files:
         if not is_intact(storage, file):
-            yield file.path, "is missing or was changed. Run the same `datagen export` again"
+            yield file.path, f"is missing or was changed. {_SAME}"
     named = {EXPORT, *(file.path for file in record.files)}
     for stored in storage.list(""):
         if stored.key not in named:
@@ -97,14 +95,12 @@ def check_export(storage: Storage, record: ExportRecord) -> Iterator[tuple[str, 
 
 def run_address(storage: Storage, record: ExportRecord) -> str:
     """The address of an export's run. InputError where it has none any more."""
-    path = record.run
-    if storage.folder is not None and "://" not in path:
-        path = os.path.normpath(storage.folder / path)
-        if not Path(path).is_dir():
-            place = f"{storage.url}/{EXPORT}"
-            raise InputError(
-                place, "run", f"{path}: no such folder", f"Move the run there. Or {_AGAIN.lower()}"
-            )
+    if storage.folder is None or "://" in record.run:
+        return record.run
+    path = os.path.normpath(storage.folder / record.run)
+    if not Path(path).is_dir():
+        fix = f"Move the run there. Or {_AGAIN.lower()}"
+        raise InputError(f"{storage.url}/{EXPORT}", "run", f"{path}: no such folder", fix)
     return path
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -35,6 +36,8 @@ from datagen.workers import registry
 Shard = tuple[RunPart, ShardPlace]
 # Scenes in a file of tables or clouds: 64 MiB of clouds of 4096 points.
 SCENES_PER_FILE = 1024
+# Of one export, so that its record stays small; and how often that is written.
+_MOST_STEPS, _RECORD_EVERY_S = 20_000, 10.0
 # Axes whose lengths may differ between merged runs.
 _UNEVEN = ("object", "point")
 
@@ -90,13 +93,11 @@ class ExportSource:
             for place in part.shards:
                 low, high = max(self.first - start, 0), min(self.past - start, place.scenes)
                 start += place.scenes
-                if low >= high:
-                    continue
-                if not groups or scenes + high - low > SCENES_PER_FILE:
-                    groups.append([])
-                    scenes = 0
-                groups[-1].append((part, _cut(place, low, high)))
-                scenes += high - low
+                if low < high:
+                    if not groups or scenes + high - low > SCENES_PER_FILE:
+                        groups, scenes = [*groups, []], 0
+                    groups[-1].append((part, _cut(place, low, high)))
+                    scenes += high - low
         return groups
 
     def scenes(self, first: int, past: int) -> Iterator[tuple[Run, SceneRows]]:
@@ -184,21 +185,35 @@ def export_run(
         refuse_other_export(storage, found, wanted)
     elif (file := next(iter(storage.list("")), None)) is not None:
         raise InputError(storage.url, file.key, "is not of an export", "Choose a new --out")
-    record = wanted if found is None else wanted.model_copy(update={"files": found.files})
-    record.write(storage)
-    for number, step in enumerate(steps):
-        kept = [file for file in record.files if file.step == number]
-        if not kept or not all(is_intact(storage, file) for file in kept):
-            before = [file for file in record.files if file.step < number]
-            new = [_write(storage, number, file) for file in step(Made(storage, before))]
-            after = [file for file in record.files if file.step > number]
-            record = record.model_copy(update={"files": (*before, *new, *after)})
-            record.write(storage)
-        if seen is not None:
-            seen(number + 1, len(steps))
-    record = record.model_copy(update={"complete": True})
-    record.write(storage)
-    return storage, record
+    if len(steps) > _MOST_STEPS:
+        fix = f"Export at most {_MOST_STEPS:,} --scenes into one folder"
+        raise InputError(source.path, "--scenes", f"is {len(steps):,} files or more", fix)
+    by_step: dict[int, list[ExportedFile]] = {}
+    for file in found.files if found else ():
+        by_step.setdefault(file.step, []).append(file)
+    made, written_s = list[ExportedFile](), time.monotonic()
+
+    def record(complete: bool = False) -> ExportRecord:
+        files = tuple(file for number in sorted(by_step) for file in by_step[number])
+        return wanted.model_copy(update={"files": files, "complete": complete})
+
+    record().write(storage)
+    try:
+        for number, step in enumerate(steps):
+            kept = by_step.get(number, ())
+            if not kept or not all(is_intact(storage, file) for file in kept):
+                by_step[number] = [_write(storage, number, f) for f in step(Made(storage, made))]
+            made += by_step[number]
+            if seen is not None:
+                seen(number + 1, len(steps))
+            if time.monotonic() - written_s > _RECORD_EVERY_S:
+                record().write(storage)
+                written_s = time.monotonic()
+    finally:
+        record().write(storage)
+    finished = record(complete=True)
+    finished.write(storage)
+    return storage, finished
 
 
 def _write(storage: Storage, number: int, file: NewFile) -> ExportedFile:

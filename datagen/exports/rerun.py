@@ -44,6 +44,7 @@ def steps(source: ExportSource) -> Sequence[Step]:
 def _chunks(run: Run, rows: SceneRows, scene: ReconstructedScene) -> Iterator[Chunk]:
     record, samples, camera = rows.record, rows.samples, scene.camera
     n = int(record["n_points"])
+    yield _static("/", rr.ViewCoordinates, xyz=[rr.components.ViewCoordinates.RIGHT_HAND_Z_UP])
     yield _mesh("house", concatenate([body.visual for body in scene.house.house.bodies]))
     for k, (model, T) in enumerate(zip(scene.models, scene.T_world_object, strict=True)):
         yield _mesh(f"objects/{k}", model.visual)
@@ -100,9 +101,7 @@ def _pose(path: str, T: F64, time_s: F64 | None = None) -> Chunk:
     """A pose (4, 4) in the world, or at each time (T, 4, 4)."""
     poses = T if time_s is not None else T[None]
     times = [] if time_s is None else [rr.TimeColumn("trial", duration=time_s)]
-    # Matrices are stored by columns.
-    turned = poses[:, :3, :3].transpose(0, 2, 1).reshape(-1, 9)
-    columns = rr.Transform3D.columns(translation=poses[:, :3, 3], mat3x3=turned)
+    columns = rr.Transform3D.columns(translation=poses[:, :3, 3], mat3x3=poses[:, :3, :3])
     return Chunk.from_columns(path, times, columns)
 
 

@@ -151,8 +151,8 @@ def test_glb_has_the_house_the_objects_and_the_candidates(run: Path, tmp_path: P
     names = [str(name) for name in rows.record["object_name"]]
     for k, name in enumerate(names):
         T = scene.graph.get(f"object/{k}/{name}")[0]
-        x, y, z = rows.record["T_world_object"][k, :3, 3]
-        np.testing.assert_allclose(T[:3, 3], [x, z, -y], atol=1e-6)
+        x, y, z, _ = rows.record["T_world_object"][k]
+        np.testing.assert_allclose(T[:3], [x, z, -y], atol=1e-6)
     assert sum(name.startswith("house/") for name in scene.geometry) > 10
     corners = scene.geometry["candidates"].vertices.reshape(-1, 3, 3)  # the tip is ahead of the middle
     base_xy, yaw = (rows.samples[name][: PER_SCENE // 2] for name in ("base_xy_m", "base_yaw_rad"))
@@ -178,13 +178,20 @@ def entities(file: Path) -> dict[str, list[Any]]:
 def test_rerun_has_the_cloud_and_the_candidates(run: Path, tmp_path: Path) -> None:
     (file,) = export(run, "rerun", tmp_path / "out", "--scenes", "2").glob("*.rrd")
     found, rows = entities(file), read_scene(Run.open(run), 2)
-    assert {"/house", "/objects/0", "/camera", "/headings"} <= set(found)
+    assert {"/", "/house", "/objects/0", "/camera", "/headings"} <= set(found)
     (cloud,), (bases,) = found["/cloud"], found["/candidates"]
     points = np.array(cloud["Points3D:positions"][0].as_py())
     wanted = rows.record["points_m"][: int(rows.record["n_points"])] + rows.record["target_center_m"]
     np.testing.assert_allclose(points, wanted, atol=1e-3)
     xy = np.array(bases["Points3D:positions"][0].as_py())[:, :2]
     np.testing.assert_allclose(xy, rows.samples["base_xy_m"], atol=1e-5)
+    pose, pinhole = sorted(found["/camera"], key=lambda batch: "Pinhole:resolution" in batch.schema.names)
+    T, (fx, _, cx, cy) = rows.record["T_world_camera"], rows.record["intrinsics_px"]
+    columns = pose["Transform3D:mat3x3"][0].as_py()[0]  # Rerun stores matrices by columns
+    np.testing.assert_allclose(columns, T[:3, :3].T.ravel(), atol=1e-6)
+    np.testing.assert_allclose(pose["Transform3D:translation"][0].as_py()[0], T[:3, 3], atol=1e-6)
+    intrinsics = pinhole["Pinhole:image_from_camera"][0].as_py()[0]
+    np.testing.assert_allclose(np.array(intrinsics)[[0, 6, 7]], [fx, cx, cy], atol=1e-4)
 
 
 @needs_rerun
