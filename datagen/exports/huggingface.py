@@ -51,9 +51,9 @@ def _table(
 ) -> Iterator[NewFile]:
     fields_of, _shards, batch_of = _TABLES[table]
     fields = fields_of(source)
+    batches = [batch_of(shard, fields) for shard in shards]  # read once for all splits
     for ours, theirs in _SPLITS.items():
-        batches = (_of_split(batch_of(shard, fields), ours) for shard in shards)
-        data, counts = parquet_of(fields, batches, source)
+        data, counts = parquet_of(fields, (_of_split(batch, ours) for batch in batches), source)
         if counts["rows"]:
             yield NewFile(f"{table}/{theirs}-{number:05d}.parquet", data, counts)
 
