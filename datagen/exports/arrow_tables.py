@@ -1,4 +1,7 @@
-"""Candidates and scenes as Arrow tables, and as Parquet with descriptions and units of columns."""
+"""Candidates and scenes as Arrow tables, and as Parquet with descriptions and units of columns.
+
+Arrow's types are unknown to type checkers: batches and schemas are Any here.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,6 @@ from datagen.tables.candidate_rows import DEFAULT, Array, candidate_columns, nee
 from datagen.train.reader import JOIN_FIELDS, native
 from datagen.workers.houses import split_of
 
-# Arrow's own types are unknown to type checkers: batches and schemas are Any here.
 # Columns of a cloud's points; rows without a point are left out.
 CLOUD = ("points_m", "rgb", "target_mask")
 _SPLIT = Field("split", "string", (), "", "", "side of the split of houses: train, val or test")

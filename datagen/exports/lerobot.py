@@ -85,8 +85,8 @@ def _scene(
             | {name: int(rows.samples[name][row]) for name in ("candidate_index", "label")}
             | {
                 f"stats/{name}/{key}": v.tolist()
-                for name, a in columns.items()
-                for key, v in _stats(a).items()
+                for name in columns
+                for key, v in _stats(columns[name]).items()
             }
         )
         start += length
@@ -107,7 +107,7 @@ def _trials(source: ExportSource, run: Run, rows: SceneRows) -> Iterator[tuple[i
         scene = source.rebuilt(run, rows.record)
         candidates = reconstruct_candidates(rows.samples, scene)
         again = ((row, try_again(scene, candidates, row, run.manifest.spec)) for row in executed)
-        yield from (one for one in again if one[1].result is not None)
+        yield from (one for one in again if one[1].result is not None and len(one[1].recording.time_s))
 
 
 def _frames(again: Retrial, fps: float) -> dict[str, Array]:

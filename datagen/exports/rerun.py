@@ -14,6 +14,9 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk, ChunkStore
 
+from datagen.drawing.posed_robot import robot_bodies
+from datagen.drawing.scene_picture import best_success
+from datagen.drawing.trial_picture import Retrial, try_again
 from datagen.exports.export_run import ExportSource, NewFile, Step, scene_key
 from datagen.exports.glb import LABEL_RGB, arrows
 from datagen.schemas.fields import SceneRows
@@ -43,12 +46,13 @@ def steps(source: ExportSource) -> Sequence[Step]:
 
 def _chunks(run: Run, rows: SceneRows, scene: ReconstructedScene) -> Iterator[Chunk]:
     record, samples, camera = rows.record, rows.samples, scene.camera
-    n = int(record["n_points"])
+    n, trial = int(record["n_points"]), _best_trial(run, rows, scene)
     yield _static("/", rr.ViewCoordinates, xyz=[rr.components.ViewCoordinates.RIGHT_HAND_Z_UP])
     yield _mesh("house", concatenate([body.visual for body in scene.house.house.bodies]))
     for k, (model, T) in enumerate(zip(scene.models, scene.T_world_object, strict=True)):
         yield _mesh(f"objects/{k}", model.visual)
-        yield _pose(f"objects/{k}", T)
+        if trial is None:  # a static pose would hide one over time
+            yield _pose(f"objects/{k}", T)
     cloud_m = record["points_m"][:n].astype(np.float32) + scene.target_center_m
     radii = np.full(n, _POINT_M)
     yield _static("cloud", rr.Points3D, positions=cloud_m, colors=record["rgb"][:n], radii=radii)
@@ -62,22 +66,22 @@ def _chunks(run: Run, rows: SceneRows, scene: ReconstructedScene) -> Iterator[Ch
         "candidates", rr.Points3D, positions=bases_m, colors=colors, radii=np.full(len(colors), _BASE_M)
     )
     yield _mesh("headings", arrows(rows))
-    if "attempts" in samples:
-        yield from _trial(run, rows, scene)
+    if trial is not None:
+        yield from _moving(run, trial)
 
 
-def _trial(run: Run, rows: SceneRows, scene: ReconstructedScene) -> Iterator[Chunk]:
-    """The best success, executed again, on the timeline `trial`."""
-    from datagen.drawing.posed_robot import robot_bodies
-    from datagen.drawing.scene_picture import best_success
-    from datagen.drawing.trial_picture import try_again
+def _best_trial(run: Run, rows: SceneRows, scene: ReconstructedScene) -> Retrial | None:
+    """The best success of a scene of `sim` labels, executed again; None where there is none."""
+    row = best_success(rows.samples) if "attempts" in rows.samples else None
+    if row is None:
+        return None
+    return try_again(scene, reconstruct_candidates(rows.samples, scene), row, run.manifest.spec)
 
-    if (row := best_success(rows.samples)) is None:
-        return
-    spec = run.manifest.spec
-    again = try_again(scene, reconstruct_candidates(rows.samples, scene), row, spec)
+
+def _moving(run: Run, again: Retrial) -> Iterator[Chunk]:
+    """A trial on the timeline `trial`: the robot's bodies, the objects, and the joints as curves."""
     recording, robot = again.recording, again.robot
-    bodies = robot_bodies(robot, float(spec.candidates.radius_of_base_m(robot.reach_m)))
+    bodies = robot_bodies(robot, float(run.manifest.spec.candidates.radius_of_base_m(robot.reach_m)))
     for k, rays in enumerate(bodies.rays):
         yield _mesh(f"robot/{k}", rays.mesh)
     moments = zip(recording.q_rad, recording.opening_m, strict=True)

@@ -202,8 +202,9 @@ def test_rerun_has_the_best_trial_over_time(sim_run: Path, tmp_path: Path) -> No
     scene = int(arrays["sample_scene_index"][arrays["outcome"] == 0][0])
     (file,) = export(sim_run, "rerun", tmp_path / "out", "--scenes", str(scene)).glob("*.rrd")
     found = entities(file)
-    moving = [batch for batch in found["/objects/0"] if "trial" in batch.schema.names]
-    heights = [row[0][2] for row in moving[0]["Transform3D:translation"].to_pylist()]
+    (moving,) = (batch for batch in found["/objects/0"] if "Transform3D:translation" in batch.schema.names)
+    assert "trial" in moving.schema.names  # a static pose beside it would hide it
+    heights = [row[0][2] for row in moving["Transform3D:translation"].to_pylist()]
     assert heights[-1] > heights[0] + 0.05  # lifted
     assert found["/joints"][0].num_rows == len(heights) > 20 and "/robot/0" in found
 
