@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from datagen.exports.export_record import (
 )
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
-from datagen.schemas.run import Rows, Run, find_scene, label_counts, open_runs
+from datagen.schemas.run import Rows, Run, label_counts, open_runs
 from datagen.schemas.run_records import FileEntry
 from datagen.schemas.shard_files import described
 from datagen.schemas.shard_reading import ShardPlace, read_scenes
@@ -102,9 +101,12 @@ class ExportSource:
 
     def scenes(self, first: int, past: int) -> Iterator[tuple[Run, SceneRows]]:
         """Each scene's run and rows, in order: its record, and those of its candidates that count."""
-        found = (find_scene(self.runs, position) for position in range(first, past))
-        for run, group in groupby(found, lambda one: one[0]):
-            each, n, indices = run.layout.candidates_per_scene, run.n, [index for _, index in group]
+        start = 0
+        for run in self.runs:
+            each, n = run.layout.candidates_per_scene, run.n
+            counted = run.counted(n)
+            indices = [counted[k] for k in range(max(first - start, 0), min(past - start, len(counted)))]
+            start += len(counted)
             for index, rows in zip(indices, read_scenes(run, indices), strict=True):
                 samples = {name: values[: n - index * each] for name, values in rows.samples.items()}
                 yield run, SceneRows(rows.record, samples)
