@@ -13,6 +13,7 @@ __version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from datagen.commands.evaluate import evaluate
+    from datagen.commands.export import export
     from datagen.commands.find_base import find_base
     from datagen.commands.merge import merge
     from datagen.commands.predict import predict
@@ -40,6 +41,7 @@ __all__ = [
     "__version__",
     "candidates",
     "evaluate",
+    "export",
     "find_base",
     "houses",
     "label_sources",
@@ -57,6 +59,7 @@ __all__ = [
 
 _MODULES = {
     "datagen.commands.evaluate": ("evaluate",),
+    "datagen.commands.export": ("export",),
     "datagen.commands.find_base": ("find_base",),
     "datagen.commands.merge": ("merge",),
     "datagen.commands.predict": ("predict",),

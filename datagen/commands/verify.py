@@ -11,6 +11,7 @@ from typing import Any
 from datagen.console.options import AsJson, AssetSources, RunPath, Sources, Whole
 from datagen.console.printing import counted, listed, print_json, print_lines, print_rows, seconds, size
 from datagen.display.progress import counting
+from datagen.exports.export_record import EXPORT, ExportRecord, check_export, read_export
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
 from datagen.schemas.checking.repair import Cleaned, Repaired, clean_runs, refuse_running, repair_runs
@@ -35,7 +36,8 @@ def verify(
     """Check a run: every record and its copy, every file and its rows, the ledger, the sealed store.
 
     Each finding names the file, the problem and the fix. Exit code 0 when there is no damage, else 1. No file
-    is written without --repair or --clean, which are refused while a job of the run may be alive.
+    is written without --repair or --clean, which are refused while a job of the run may be alive. Of an
+    export, check its files, and that its run has not changed since.
 
     For example: datagen verify runs/first
 
@@ -50,6 +52,11 @@ def verify(
     if not 0 <= replay <= 1_000_000:
         raise InputError("--replay", str(replay), "is not between 0 and 1,000,000", "Give a number of scenes")
     storage = open_storage(run, probe=False, create=False)
+    if (exported := read_export(storage)) is not None:
+        if repair or replay or clean:
+            fix = "Give it for the run, or run the same `datagen export` again"
+            raise InputError(run, EXPORT, "is an export, of which there is nothing to repair or replay", fix)
+        return _verify_export(storage, exported, json)
     if clean:
         refuse_running(storage)  # before the check, which takes time
     checked, found, repaired, cleaned = Checked(), _Found(), None, None
@@ -73,6 +80,17 @@ def verify(
     else:
         _print(report, checked, found, repaired)
     return 1 if found.damage else 0
+
+
+def _verify_export(storage: Storage, record: ExportRecord, json: bool) -> int:
+    found = [{"file": file, "problem": problem} for file, problem in check_export(storage, record)]
+    files = f"{counted(len(record.files), 'file')}, every byte"
+    clean = f"clean: {storage.url} is the {record.format} export of {record.run} ({files})"
+    if json:
+        print_json({"export": storage.url, "run": record.run, "clean": not found, "findings": found})
+    else:
+        print_lines("\n".join("{file}: {problem}".format(**each) for each in found) or clean)
+    return 1 if found else 0
 
 
 def _replay(

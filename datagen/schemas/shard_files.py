@@ -263,7 +263,9 @@ def _checked_text(field: Field, values: Array) -> Array:
 CONVENTIONS = "CF-1.11, ACDD-1.3"
 
 
-class _Asset(NamedTuple):
+class Asset(NamedTuple):
+    """Content that labels were made from, with its licence and how to cite it."""
+
     name: str
     licence: str
     reference: str
@@ -273,11 +275,11 @@ class _Asset(NamedTuple):
 _NOT_STATED = "not stated"
 _OURS = "datagen, which comes with it"
 _BUILTIN = {
-    "houses": _Asset("built-in houses", "Apache-2.0", _OURS),
-    "objects": _Asset("built-in objects", "Apache-2.0", _OURS),
+    "houses": Asset("built-in houses", "Apache-2.0", _OURS),
+    "objects": Asset("built-in objects", "Apache-2.0", _OURS),
 }
 # As the package states for its assets, which include the robots.
-_ROBOTS = _Asset(
+_ROBOTS = Asset(
     "ManiSkill robot models",
     "CC-BY-NC-4.0",
     "Tao et al., ManiSkill3: GPU Parallelized Robotics Simulation and Rendering for Generalizable Embodied "
@@ -297,7 +299,7 @@ def described(
 
     `sources` are those of the runs' manifests, which hold the statements of folders.
     """
-    each = [_assets(spec, known) for spec, known in zip(specs, sources, strict=True)]
+    each = [assets_of(spec, known) for spec, known in zip(specs, sources, strict=True)]
     assets = list(dict.fromkeys(asset for found in each for asset in found))
     labels = _listed(spec.label_source for spec in specs)
     houses, objects = (_listed(found[k].name for found in each) for k in (0, 1))
@@ -331,14 +333,17 @@ def cf_attributes(field: Field, table: Table) -> dict[str, Any]:
     return coordinates | ({"flag_values": list(range(len(field.codes)))} if field.codes else {})
 
 
-def _assets(spec: Specification, known: Mapping[str, str]) -> list[_Asset]:
-    """Houses, objects and, for an arm, robots."""
-    found: list[_Asset] = []
+def assets_of(spec: Specification, known: Mapping[str, str]) -> list[Asset]:
+    """Houses, objects and, for an arm, robots; other packages' robots and files state no licence."""
+    found: list[Asset] = []
     for what, source in (("houses", spec.houses), ("objects", spec.objects)):
         title = known.get(f"{what}_title", f"{what} read as {source.kind}")
         told = (known.get(f"{what}_{key}", _NOT_STATED) for key in ("licence", "attribution"))
-        found.append(_BUILTIN[what] if source.kind == "builtin" else _Asset(title, *told))
-    return found if spec.arm is None else [*found, _ROBOTS]
+        found.append(_BUILTIN[what] if source.kind == "builtin" else Asset(title, *told))
+    if spec.arm is None:
+        return found
+    own = Asset(f"robot {spec.arm.robot}", _NOT_STATED, _NOT_STATED)
+    return [*found, _ROBOTS if spec.arm.robot_digest is None else own]
 
 
 def _source(spec: Specification) -> str:

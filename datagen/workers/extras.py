@@ -75,6 +75,8 @@ EXTRAS: dict[str, Extra] = {
     "tables": Extra(
         "open_dataset and candidates: xarray and pandas", {"pandas": "pandas", "xarray": "xarray"}
     ),
+    "export": Extra("export to parquet and huggingface", {"pyarrow": "pyarrow"}),
+    "rerun": Extra("export to rerun", {"rerun": "rerun-sdk"}),
     "pybullet": Extra("a second settler", {"pybullet": "pybullet"}),
 }
 

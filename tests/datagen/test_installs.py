@@ -100,6 +100,7 @@ def test_the_base_keeps_runs_and_names_what_it_lacks(wheel: Path, copied: Path, 
     works: list[Command] = [
         ["--help"], ["doctor", "--help"], ["assets", "list"], *([verb, copied] for verb in verbs),
         ["merge", copied, "--out", tmp_path / "merged"],
+        ["export", copied, "--to", "webdataset", "--out", tmp_path / "tars"],
     ]  # fmt: skip
     lacks_labels: list[Command] = [
         submit_arguments(out, PER_SCENE),
@@ -113,7 +114,8 @@ def test_the_base_keeps_runs_and_names_what_it_lacks(wheel: Path, copied: Path, 
         ["evaluate", "model.ckpt", copied],
     ]
     lacks_predict = ["predict", "model.ckpt", "--frame", "frame", *ROBOT]
-    done = base.run(*works, ["doctor"], *lacks_labels, *lacks_train, lacks_predict)
+    lacks_export = ["export", copied, "--to", "parquet", "--out", out]
+    done = base.run(*works, ["doctor"], *lacks_labels, *lacks_train, lacks_predict, lacks_export)
     for each in islice(done, len(works)):
         assert each.code == 0, each
     doctor = next(done)
@@ -124,6 +126,7 @@ def test_the_base_keeps_runs_and_names_what_it_lacks(wheel: Path, copied: Path, 
     for each in islice(done, len(lacks_train)):
         base.assert_lacks("train", each)
     base.assert_lacks("predict", next(done))
+    base.assert_lacks("export", next(done))
     assert next(done, None) is None and not out.exists()
 
 

@@ -1,0 +1,13 @@
+"""Runs in formats that other programs read. FORMATS is the registry; each format lives in one file."""
+
+from __future__ import annotations
+
+# A format is a function from an ExportSource to the steps that make its files, in order.
+FORMATS: dict[str, str] = {
+    "glb": "datagen.exports.glb:steps",
+    "huggingface": "datagen.exports.huggingface:steps",
+    "lerobot": "datagen.exports.lerobot:steps",
+    "parquet": "datagen.exports.parquet:steps",
+    "rerun": "datagen.exports.rerun:steps",
+    "webdataset": "datagen.exports.webdataset:steps",
+}
