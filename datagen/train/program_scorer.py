@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +13,7 @@ import numpy as np
 
 from datagen.train.hands.poses import poses_of_clouds
 from datagen.train.hands.reach import hand_reach, hands_of
-from datagen.train.inputs import F32, F64, Array, Batch, CandidateInputs
+from datagen.train.inputs import F32, F64, Array, Batch, Bools, CandidateInputs, is_clear
 from datagen.train.observed_visibility import visible_share
 from datagen.train.programs import read_program
 
@@ -27,7 +29,13 @@ Arrays = Mapping[str, Array]
 
 
 class ProgramScorer:
-    """A scorer, as `ModelScorer` of the model of which the program was made. InputError for another file."""
+    """A scorer, as `ModelScorer` of the model of which the program was made. InputError for another file.
+
+    With `only_clear` the score of a base that is not clear is 0, without computing it. The scores of the last
+    `keeps` batches are kept.
+    """
+
+    only_clear, keeps = False, 0
 
     def __init__(self, path: Path, name: str = "") -> None:
         self.program = read_program(path)
@@ -35,15 +43,23 @@ class ProgramScorer:
         self.name, self.threshold = f"{name}{facts['name']}", 0.5
         self.robots: dict[str, tuple[float, float]] = {k: (v[0], v[1]) for k, v in facts["robots"].items()}
         self.side_deg: float | None = facts["side_deg"]
+        self._kept = OrderedDict[str, F64]()
+        self._of_scene, self._of_each = self.program.functions[SCORE].divided((*TOKENS, *TO_SCORE[:3]))
 
     def score(self, batch: Batch[Array]) -> F64:
         """Probabilities (N,)."""
-        found = np.empty(len(batch))
-        for k in range(len(batch.robots)):
-            rows = np.flatnonzero(batch.candidates.robot_row == k)
-            if len(rows):
-                found[rows] = self._of_robot(batch, k, rows)
-        return found
+        wanted = is_clear(batch) if self.only_clear else np.ones(len(batch), np.bool_)
+        key = _digest(batch, wanted) if self.keeps else ""
+        if (found := self._kept.pop(key, None)) is None:
+            found = np.zeros(len(batch))
+            for k in range(len(batch.robots)):
+                rows = np.flatnonzero(wanted & (batch.candidates.robot_row == k))
+                if len(rows):
+                    found[rows] = self._of_robot(batch, k, rows)
+        self._kept[key] = found
+        while len(self._kept) > self.keeps:
+            self._kept.popitem(last=False)
+        return found.copy()
 
     def _of_robot(self, batch: Batch[Array], k: int, rows: Array) -> F64:
         robot = _rows(batch.robots, np.array([k]))
@@ -60,21 +76,27 @@ class ProgramScorer:
         tokens: dict[str, Array] = dict(zip(TOKENS, self.program.run(ENCODE, of_cloud), strict=True))
         n_poses, hands = int(self.program.facts["hand_poses"]), hands_of(robot, 1)
         poses = poses_of_clouds(cloud.points_m, cloud.target_mask, cloud.n_points, n_poses, hands)
-        shared = {
-            **tokens,
-            "camera_rise_m": camera_rise_m,
-            "reach_m": np.maximum(robot.arm_reach_m, _MIN_REACH_M),
-            "poses": poses,
-        }
+        reach_m = np.maximum(robot.arm_reach_m, _MIN_REACH_M)
+        shared = tokens | {"camera_rise_m": camera_rise_m, "reach_m": reach_m, "poses": poses}
+        constants = self.program.constants
+        done = self._of_scene.run(constants, shared)
+        shared |= dict(zip(self._of_scene.outputs, done, strict=True))
         rho = _visible_share(of_cloud, tokens, candidates, float(camera_rise_m[0]))
         codes = hand_reach(poses, robot, candidates, tokens["rise_m"])
         logits: list[F32] = []
         for start in range(0, len(rows), AT_ONCE):
             some = np.minimum(np.arange(start, start + AT_ONCE), len(rows) - 1)
             own = {"base_xy_m": candidates.base_xy_m[some], "rho": rho[some], "codes": codes[some]}
-            logits += self.program.run(SCORE, shared | own)
+            logits += self._of_each.run(constants, shared | own)
         bad, good = np.concatenate(logits)[: len(rows)].astype(np.float64).T
         return 1 / (1 + np.exp(bad - good))
+
+
+def _digest(batch: Batch[Array], wanted: Bools) -> str:
+    """Digest of all that scores depend on."""
+    tables = vars(batch.clouds), vars(batch.robots), vars(batch.candidates), {"": wanted}
+    arrays = [a for table in tables for a in table.values() if a is not None]
+    return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
 
 
 def _rows(table: T, rows: Array) -> T:

@@ -87,9 +87,10 @@ def observe_cells(
     offsets, base = grid_offsets(params), robot.outline
     base_xy, yaw = center_m[:2] + offsets, headings(offsets.astype(np.float32), robot)
     z = seen.points_m[:, 2]
-    gap_m = np.min([distances_m(seen.points_m, eye) for eye in seen.eyes_m], axis=0)
-    is_floor = np.any([floor_points(seen.points_m, eye) for eye in seen.eyes_m], axis=0)
-    above = (z > STEP_M + 2 * depth_error_m(gap_m)) & ~is_floor
+    far_m = [distances_m(seen.points_m, eye) for eye in seen.eyes_m]
+    each_floor = [floor_points(seen.points_m, *of_eye) for of_eye in zip(seen.eyes_m, far_m, strict=True)]
+    is_floor = np.logical_or.reduce(each_floor)
+    above = (z > STEP_M + 2 * depth_error_m(np.minimum.reduce(far_m))) & ~is_floor
     mount, top = robot.base_height_m, max(robot.camera_height_m, robot.base_height_m)
     low_points = seen.points_m[above & (z < mount + _BOARD_M)]
     tops = seen.points_m[above & (z >= mount) & (z < top)]
@@ -136,7 +137,7 @@ def _crowded(points_m: F32, base_xy: F64, yaw: F64, base: Footprint) -> Bools:
     if not len(cells):
         return np.zeros(len(base_xy), np.bool_)
     thin, weight = low + _THIN_M * (np.column_stack(np.divmod(cells, n)) + 0.5), counts[cells]
-    tree = KDTree(thin)
+    tree = KDTree(thin, compact_nodes=False, balanced_tree=False)  # built faster
     # Every outline holds this circle: few bases are left whose points must be counted one by one.
     crowded = tree.query_ball_point(base_xy, base.inner_radius_m, return_length=True) >= _LEAST_POINTS
     left = np.flatnonzero(~crowded)

@@ -166,7 +166,7 @@ def _sights(points_m: F32, eyes_m: F64) -> tuple[list[F64], list[_Ends]]:
         rel = points_m[:, :2] - eye[:2].astype(np.float32)
         gap = np.hypot(rel[:, 0], rel[:, 1])
         bearing = _bearing(rel)
-        order = np.lexsort([gap, bearing])
+        order = np.argsort(bearing * 1024.0 + gap)  # by bearing, then by distance
         bearing, gap, z = bearing[order], gap[order], points_m[order, 2]
         first = np.searchsorted(bearing, np.arange(_BEARINGS + 1))
         near, far, wall = np.zeros(_BEARINGS), np.zeros(_BEARINGS), np.zeros(_BEARINGS, np.bool_)

@@ -119,9 +119,12 @@ def distances_m(points_m: F32 | F64, eye_m: F64) -> F64:
     return np.sqrt(x * x + y * y + z * z)
 
 
-def floor_points(points_m: F32 | F64, eye_m: F64) -> Bools:
-    """Mask (N,) of world points (N, 3) on z = 0, within the error of a camera at `eye_m` (3,)."""
-    far_m = distances_m(points_m, eye_m)
+def floor_points(points_m: F32 | F64, eye_m: F64, far_m: F64 | None = None) -> Bools:
+    """Mask (N,) of world points (N, 3) on z = 0, within the error of a camera at `eye_m` (3,).
+
+    `far_m` (N,) are their distances from it, where they are known.
+    """
+    far_m = distances_m(points_m, eye_m) if far_m is None else far_m
     slope = np.abs(eye_m[2]) / np.maximum(far_m, 1e-6)
     return np.abs(points_m[:, 2]) < 0.015 + 3 * depth_error_m(far_m) * np.minimum(slope, 1.0)
 
@@ -142,7 +145,7 @@ def _refuse_pose(frame: SensorFrame, T: F64) -> None:
         "Give T_world_camera of the camera's optical axes (x right, y down, z forward), in a world with z up "
         "and the floor at z = 0"
     )
-    z = moved(frame.points_m, T)[:, 2]
+    z = frame.points_m @ T[2, :3].astype(np.float32) + T[2, 3]
     under = float((z < -0.1 - 4 * depth_error_m(frame.points_m[:, 2])).mean())
     problem = ""
     if T[2, 2] > _STEEPLY_UP:

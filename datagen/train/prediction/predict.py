@@ -185,8 +185,8 @@ def _fill(frames: Sequence[SensorFrame]) -> tuple[list[SensorFrame], Filled | No
 
 
 def _locate(seen: SeenPoints) -> TargetBox:
-    points = seen.points_m.astype(np.float64)
-    return locate(points[seen.on_target], points[~seen.on_target], seen.eyes_m[0])
+    target = seen.points_m[seen.on_target].astype(np.float64)
+    return locate(target, seen.points_m[~seen.on_target], seen.eyes_m[0])
 
 
 def _grid(cells: int, half_width_m: float) -> CandidateParams:
