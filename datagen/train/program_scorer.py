@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections import OrderedDict
+import pickle
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 
 from datagen.train.hands.poses import poses_of_clouds
 from datagen.train.hands.reach import hand_reach, hands_of
-from datagen.train.inputs import F32, F64, Array, Batch, Bools, CandidateInputs, is_clear
+from datagen.train.inputs import F32, F64, Array, Batch, CandidateInputs, is_clear
 from datagen.train.observed_visibility import visible_share
 from datagen.train.programs import read_program
 
@@ -23,6 +22,7 @@ AT_ONCE = 125  # candidates in one call; 625 are a grid
 CLOUD = ("points_m", "rgb", "mask", "count", "height_m", "base_height_m", "reach_m")
 TOKENS = ("same", "left", "centres_m", "valid", "numbers", "vectors", "tensors", "radius_m", "rise_m")
 TO_SCORE = ("camera_rise_m", "reach_m", "poses", "base_xy_m", "rho", "codes")
+_MOST_KEPT = 7  # other batches
 _MIN_REACH_M = np.float32(0.05)
 T = TypeVar("T")
 Arrays = Mapping[str, Array]
@@ -31,11 +31,11 @@ Arrays = Mapping[str, Array]
 class ProgramScorer:
     """A scorer, as `ModelScorer` of the model of which the program was made. InputError for another file.
 
-    With `only_clear` the score of a base that is not clear is 0, without computing it. The scores of the last
-    `keeps` batches are kept.
+    With `only_clear` the score of a base that is not clear is 0, without computing it. The latest scores are
+    kept: of the same frame, another arrival error may be asked for.
     """
 
-    only_clear, keeps = False, 0
+    only_clear = False
 
     def __init__(self, path: Path, name: str = "") -> None:
         self.program = read_program(path)
@@ -43,22 +43,20 @@ class ProgramScorer:
         self.name, self.threshold = f"{name}{facts['name']}", 0.5
         self.robots: dict[str, tuple[float, float]] = {k: (v[0], v[1]) for k, v in facts["robots"].items()}
         self.side_deg: float | None = facts["side_deg"]
-        self._kept = OrderedDict[str, F64]()
-        self._of_scene, self._of_each = self.program.functions[SCORE].divided((*TOKENS, *TO_SCORE[:3]))
+        self._kept = dict[bytes, F64]()
 
     def score(self, batch: Batch[Array]) -> F64:
         """Probabilities (N,)."""
         wanted = is_clear(batch) if self.only_clear else np.ones(len(batch), np.bool_)
-        key = _digest(batch, wanted) if self.keeps else ""
-        if (found := self._kept.pop(key, None)) is None:
+        key = pickle.dumps((batch.clouds, batch.robots, batch.candidates, wanted))
+        if (found := self._kept.get(key)) is None:
             found = np.zeros(len(batch))
             for k in range(len(batch.robots)):
                 rows = np.flatnonzero(wanted & (batch.candidates.robot_row == k))
                 if len(rows):
                     found[rows] = self._of_robot(batch, k, rows)
-        self._kept[key] = found
-        while len(self._kept) > self.keeps:
-            self._kept.popitem(last=False)
+        others = [each for each in self._kept.items() if each[0] != key]
+        self._kept = dict([*others[-_MOST_KEPT:], (key, found)])
         return found.copy()
 
     def _of_robot(self, batch: Batch[Array], k: int, rows: Array) -> F64:
@@ -78,25 +76,15 @@ class ProgramScorer:
         poses = poses_of_clouds(cloud.points_m, cloud.target_mask, cloud.n_points, n_poses, hands)
         reach_m = np.maximum(robot.arm_reach_m, _MIN_REACH_M)
         shared = tokens | {"camera_rise_m": camera_rise_m, "reach_m": reach_m, "poses": poses}
-        constants = self.program.constants
-        done = self._of_scene.run(constants, shared)
-        shared |= dict(zip(self._of_scene.outputs, done, strict=True))
         rho = _visible_share(of_cloud, tokens, candidates, float(camera_rise_m[0]))
         codes = hand_reach(poses, robot, candidates, tokens["rise_m"])
         logits: list[F32] = []
         for start in range(0, len(rows), AT_ONCE):
             some = np.minimum(np.arange(start, start + AT_ONCE), len(rows) - 1)
             own = {"base_xy_m": candidates.base_xy_m[some], "rho": rho[some], "codes": codes[some]}
-            logits += self._of_each.run(constants, shared | own)
+            logits += self.program.run(SCORE, shared | own)
         bad, good = np.concatenate(logits)[: len(rows)].astype(np.float64).T
         return 1 / (1 + np.exp(bad - good))
-
-
-def _digest(batch: Batch[Array], wanted: Bools) -> str:
-    """Digest of all that scores depend on."""
-    tables = vars(batch.clouds), vars(batch.robots), vars(batch.candidates), {"": wanted}
-    arrays = [a for table in tables for a in table.values() if a is not None]
-    return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
 
 
 def _rows(table: T, rows: Array) -> T:

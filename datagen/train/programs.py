@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import operator
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +22,6 @@ from safetensors import SafetensorError, safe_open
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array
 
-_LARGE = 4096  # numbers of an array from which new memory costs more than the look at it
 MARK = "%"  # before the name of an earlier step, a constant or an input
 
 
@@ -49,61 +48,23 @@ class Function:
         return {name for step in self.steps for name in _named(step)} | set(self.outputs)
 
     @cached_property
-    def _plan(self) -> list[tuple[Step, list[tuple[int, Any]], bool, set[str]]]:
-        """Steps, each with its arguments that are to be filled, whether the first may be overwritten, and
-        what no step after it needs, of results and inputs that are no outputs.
-        """
-        names, own = [_named(step) for step in self.steps], {step.name for step in self.steps}
-        memory: dict[str, str] = {}  # the first of the names that may share it
-        for step in self.steps:
-            memory[step.name] = memory.get(_first(step), step.name) if step.op in _SHARES else step.name
-        last = {name: k for k, found in enumerate(names) for name in found}
-        last |= dict.fromkeys(self.outputs, len(names))
-        until = dict[str, int]()
-        for name in own & last.keys():
-            until[memory[name]] = max(until.get(memory[name], 0), last[name])
-        plan: list[tuple[Step, list[tuple[int, Any]], bool, set[str]]] = []
-        for k, (step, found) in enumerate(zip(self.steps, names, strict=True)):
-            holes = [(at, each) for at, each in enumerate(step.args) if _is_hole(each)]
-            free = step.op in _OVERWRITE and until.get(memory.get(_first(step), "")) == k
-            dropped = {name for name in found if last[name] == k and name in own.union(self.inputs)}
-            plan.append((step, holes, free, dropped))
-        return plan
+    def _dropped(self) -> list[set[str]]:
+        """What no step after each one needs, of results and inputs that are no outputs."""
+        last = {name: k for k, step in enumerate(self.steps) for name in _named(step)}
+        own = {step.name for step in self.steps} | set(self.inputs)
+        dropped = [set[str]() for _ in self.steps]
+        for name in own & last.keys() - set(self.outputs):
+            dropped[last[name]].add(name)
+        return dropped
 
     def run(self, constants: Mapping[str, Array], inputs: Mapping[str, Array]) -> list[Array]:
         """The outputs for inputs by name."""
         known: dict[str, Any] = {**constants, **inputs}
-        for step, holes, free, dropped in self._plan:
-            args = list(step.args)
-            for k, hole in holes:
-                args[k] = known[hole[1:]] if isinstance(hole, str) else _filled(hole, known)
-            if free and _holds(*args):
-                found = _OVERWRITE[step.op](args[0], args[1] if len(args) > 1 else 0, out=args[0])
-            else:
-                found = OPERATIONS[step.op](*args, **step.options)
-            known[step.name] = found
+        for step, dropped in zip(self.steps, self._dropped, strict=True):
+            known[step.name] = OPERATIONS[step.op](*_filled(step.args, known), **_filled(step.options, known))
             for name in dropped:
                 del known[name]
         return [known[name] for name in self.outputs]
-
-    def divided(self, given: Collection[str]) -> tuple[Function, Function]:
-        """A function of the steps that need no other inputs than those given, and one of the others.
-
-        The outputs of the first are inputs of the second.
-        """
-        late, steps = set(self.inputs) - set(given), (list[Step](), list[Step]())
-        for step in self.steps:
-            is_late = not late.isdisjoint(_named(step))
-            steps[is_late].append(step)
-            if is_late:
-                late.add(step.name)
-        needed = Function((), self.outputs, tuple(steps[True])).named()
-        kept = tuple(step.name for step in steps[False] if step.name in needed)
-        inputs = tuple(name for name in self.inputs if name in needed)
-        own = tuple(name for name in self.inputs if name in given)
-        return Function(own, kept, tuple(steps[False])), Function(
-            (*kept, *inputs), self.outputs, tuple(steps[True])
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,30 +117,13 @@ def _named(step: Step) -> set[str]:
     return found
 
 
-def _first(step: Step) -> str:
-    """The name of its first argument; "" for a value."""
-    first = step.args[0] if step.args else ""
-    return first[1:] if _is_hole(first) and isinstance(first, str) else ""
-
-
-def _is_hole(value: Any) -> bool:
-    return isinstance(value, list | tuple) or (isinstance(value, str) and value.startswith(MARK))
-
-
-def _holds(x: Any, y: Any = 0) -> bool:
-    """Whether an array may be overwritten by its sum or product with `y`: of the same type and shape."""
-    if not isinstance(x, np.ndarray) or x.size < _LARGE or not x.flags.writeable or x.dtype.kind != "f":
-        return False
-    return not isinstance(y, np.ndarray) or (
-        x.dtype == y.dtype and np.broadcast_shapes(x.shape, y.shape) == x.shape
-    )
-
-
 def _filled(value: Any, known: Mapping[str, Any]) -> Any:
     if isinstance(value, str):
         return known[value[1:]] if value.startswith(MARK) else value
     if isinstance(value, list | tuple):
         return [_filled(each, known) for each in value]
+    if isinstance(value, Mapping):
+        return {key: _filled(each, known) for key, each in value.items()}
     return value
 
 
@@ -212,17 +156,10 @@ def _layer_norm(x: Array, shape: Sequence[int], weight: Array, bias: Array, eps:
     # A product with ones is several times as fast as a mean along short rows.
     away = x.reshape(-1, size := math.prod(shape))
     away = away - away @ np.full((size, 1), 1 / size, away.dtype)
-    variance = np.einsum("ij,ij->i", away, away)[:, None] / size
-    away = (away * (1 / np.sqrt(variance + eps))).reshape(x.shape)
-    away *= weight
+    away *= 1 / np.sqrt(np.einsum("ij,ij->i", away, away)[:, None] / size + eps)
+    away = away.reshape(x.shape) * weight
     away += bias
     return (away,)
-
-
-def _addmm(b: Array, x: Array, w: Array) -> Array:
-    found = x @ w
-    found += b
-    return found
 
 
 def _softmax(x: Array, axis: int, _: bool) -> Array:
@@ -272,7 +209,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "_to_copy": lambda x, dtype=None: x if dtype is None else x.astype(dtype),
     "abs": np.abs,
     "add": _real(operator.add),
-    "addmm": _addmm,
+    "addmm": lambda b, x, w: b + x @ w,
     "amax": _reduced(np.max),
     "amin": _reduced(np.min),
     "arange": _arange,
@@ -325,8 +262,3 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "view": np.reshape,
     "where": np.where,
 }
-# Operations whose results may share the memory of their first argument.
-_SHARES = {"_to_copy", "clone", "expand", "getitem", "index", "permute", "select", "slice", "split_with_sizes"}
-_SHARES |= {"squeeze", "unsqueeze", "view"}
-# Operations that may write into their first argument, where no later step needs it; 0 is relu's other one.
-_OVERWRITE: dict[str, Any] = {"add": np.add, "mul": np.multiply, "relu": np.maximum, "sub": np.subtract}

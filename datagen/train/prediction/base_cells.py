@@ -87,10 +87,9 @@ def observe_cells(
     offsets, base = grid_offsets(params), robot.outline
     base_xy, yaw = center_m[:2] + offsets, headings(offsets.astype(np.float32), robot)
     z = seen.points_m[:, 2]
-    far_m = [distances_m(seen.points_m, eye) for eye in seen.eyes_m]
-    each_floor = [floor_points(seen.points_m, *of_eye) for of_eye in zip(seen.eyes_m, far_m, strict=True)]
-    is_floor = np.logical_or.reduce(each_floor)
-    above = (z > STEP_M + 2 * depth_error_m(np.minimum.reduce(far_m))) & ~is_floor
+    gap_m = np.minimum.reduce([distances_m(seen.points_m, eye) for eye in seen.eyes_m])
+    is_floor = np.logical_or.reduce([floor_points(seen.points_m, eye) for eye in seen.eyes_m])
+    above = (z > STEP_M + 2 * depth_error_m(gap_m)) & ~is_floor
     mount, top = robot.base_height_m, max(robot.camera_height_m, robot.base_height_m)
     low_points = seen.points_m[above & (z < mount + _BOARD_M)]
     tops = seen.points_m[above & (z >= mount) & (z < top)]

@@ -9,12 +9,7 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import F64, Bools
-from datagen.workers.geometry.planar import (
-    crosses_itself,
-    following,
-    inside_polygon,
-    signed_distances_to_convex,
-)
+from datagen.workers.geometry.planar import crosses_itself, distance_to_border, inside_polygon
 from datagen.workers.robots import ROBOTS, robot_limits
 
 _SMALLEST_M, _LARGEST_M = 0.02, 2.0  # limits of a base, from the mount's axis
@@ -63,9 +58,7 @@ class Footprint:
     @property
     def inner_radius_m(self) -> float:
         """Radius of the largest circle around the arm's mount that it holds."""
-        sides = np.stack([self.polygon_m, following(self.polygon_m)], axis=1)
-        distance_m = signed_distances_to_convex(np.zeros((1, 2)), sides)  # of a side, which has no inside
-        return float(distance_m.min()) if self.corners_m else self.radius_m
+        return distance_to_border(self.polygon_m) if self.corners_m else self.radius_m
 
     def holds(self, points_m: F64) -> Bools:
         """Mask (N,) of points (N, 2), in the base's frame, that lie in it."""

@@ -119,12 +119,9 @@ def distances_m(points_m: F32 | F64, eye_m: F64) -> F64:
     return np.sqrt(x * x + y * y + z * z)
 
 
-def floor_points(points_m: F32 | F64, eye_m: F64, far_m: F64 | None = None) -> Bools:
-    """Mask (N,) of world points (N, 3) on z = 0, within the error of a camera at `eye_m` (3,).
-
-    `far_m` (N,) are their distances from it, where they are known.
-    """
-    far_m = distances_m(points_m, eye_m) if far_m is None else far_m
+def floor_points(points_m: F32 | F64, eye_m: F64) -> Bools:
+    """Mask (N,) of world points (N, 3) on z = 0, within the error of a camera at `eye_m` (3,)."""
+    far_m = distances_m(points_m, eye_m)
     slope = np.abs(eye_m[2]) / np.maximum(far_m, 1e-6)
     return np.abs(points_m[:, 2]) < 0.015 + 3 * depth_error_m(far_m) * np.minimum(slope, 1.0)
 

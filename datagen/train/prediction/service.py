@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
 import hmac
+import multiprocessing
+import os
+import re
+import signal
 import tempfile
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import Depends, FastAPI, HTTPException, Query, Request
-from starlette.concurrency import run_in_threadpool
 
 from datagen import __version__
 from datagen.schemas.errors import InputError
@@ -19,60 +27,73 @@ from datagen.train.prediction.frames import SensorFrame, read_place
 from datagen.train.prediction.prediction_report import document
 
 MOST_BYTES, MOST_SESSIONS, MOST_FRAMES = 64 << 20, 8, 6
+_BODY = "body.npz"
 
 Ask = Callable[[list[SensorFrame], dict[str, Any]], Prediction]  # of frames and options of a request
+_asks: list[Ask] = []  # the one of this worker process
 
 
-class Sessions:
+class Sessions(OrderedDict[str, list[bytes]]):
     """Frames of the latest sessions. The oldest frames and the longest unused sessions go first."""
 
-    def __init__(self) -> None:
-        self._frames = OrderedDict[str, list[SensorFrame]]()
-        self._lock = threading.Lock()
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def joined(self, name: str, frame: SensorFrame) -> list[SensorFrame]:
-        """The session's frames with a new one."""
-        with self._lock:
-            frames = [*self._frames.pop(name, []), frame][-MOST_FRAMES:]
-            self._frames[name] = frames
-            while len(self._frames) > MOST_SESSIONS:
-                self._frames.popitem(last=False)
-            return frames
-
-    def forget(self, name: str) -> bool:
-        """Remove a session; whether it was there."""
-        with self._lock:
-            return self._frames.pop(name, None) is not None
+    def add(self, name: str, frame: bytes) -> None:
+        """Keep a new frame of a session."""
+        self[name] = [*self.pop(name, []), frame][-MOST_FRAMES:]
+        while len(self) > MOST_SESSIONS:
+            self.popitem(last=False)
 
 
-def make_app(ask: Ask, model: str, token: str | None) -> FastAPI:
-    """The application. Answers are computed one at a time; with a token, requests must give it."""
-    sessions, one_at_a_time = Sessions(), threading.Lock()
+def _start(make_ask: Callable[[], Ask]) -> None:
+    """Set up a worker process, which ends with the service. Ctrl-C reaches both, and only that handles it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    service = multiprocessing.parent_process()
+    assert service is not None
+    threading.Thread(target=lambda: (service.join(), os._exit(1)), daemon=True).start()
+    _asks.append(make_ask())
+
+
+@lru_cache(maxsize=MOST_FRAMES)
+def _frame(body: bytes) -> SensorFrame:
+    with tempfile.TemporaryDirectory() as folder:
+        (file := Path(folder) / _BODY).write_bytes(body)
+        return read_place(file)
+
+
+def _answer(bodies: list[bytes], options: dict[str, Any]) -> dict[str, Any]:
+    return document(_asks[0]([_frame(body) for body in bodies], options))
+
+
+def make_app(make_ask: Callable[[], Ask], model: str, token: str | None) -> FastAPI:
+    """The application, with one worker process a core; with a token, requests must give it."""
+    sessions, pools, count = Sessions(), list[ProcessPoolExecutor](), len(os.sched_getaffinity(0))
+
+    def start_workers() -> None:
+        context = multiprocessing.get_context("spawn")
+        pools[:] = [ProcessPoolExecutor(count, context, _start, (make_ask,))]
+        for _ in range(count):
+            pools[0].submit(int)  # starts a process
 
     def allowed(request: Request) -> None:
         given = request.headers.get("authorization", "")
         if token is not None and not hmac.compare_digest(given.encode(), f"Bearer {token}".encode()):
             raise HTTPException(401, "give the token: Authorization: Bearer WORD")
 
-    def answer(data: bytes, session: str | None, options: dict[str, Any]) -> dict[str, Any]:
-        with tempfile.NamedTemporaryFile(suffix=".npz") as file:
-            file.write(data)
-            file.flush()
-            try:
-                frame = read_place(file.name)
-                frames = [frame] if session is None else sessions.joined(session, frame)
-                with one_at_a_time:
-                    return document(ask(frames, options))
-            except InputError as error:
-                raise HTTPException(422, str(error).replace(file.name, "the body")) from None
+    async def answer(bodies: list[bytes], options: dict[str, Any]) -> dict[str, Any]:
+        pool = pools[0]
+        try:
+            return await asyncio.wrap_future(pool.submit(_answer, bodies, options))
+        except InputError as error:
+            raise HTTPException(422, re.sub(rf"\S*/{_BODY}", "the body", str(error))) from None
+        except BrokenProcessPool:
+            if pool is pools[0]:
+                start_workers()
+            raise HTTPException(503, "a worker process ended without a message: ask again") from None
 
+    start_workers()
     app = FastAPI(title="datagen", version=__version__, dependencies=[Depends(allowed)])
 
     @app.get("/health")
-    def health() -> dict[str, Any]:  # pyright: ignore[reportUnusedFunction]
+    async def health() -> dict[str, Any]:  # pyright: ignore[reportUnusedFunction]
         """Which model answers, and how many sessions there are."""
         return {"model": model, "sessions": len(sessions)}
 
@@ -97,13 +118,17 @@ def make_app(ask: Ask, model: str, token: str | None) -> FastAPI:
             "arrival": arrival,
             "allow_unseen": allow_unseen,
             "camera_height": camera_height,
+            "candidates": candidates,
         }
-        found = await run_in_threadpool(answer, bytes(data), session, options)
+        frames = [*sessions.get(session or "", ()), bytes(data)][-MOST_FRAMES:]
+        found = await answer(frames, options)
+        if session is not None:  # not before: a frame that cannot be read would spoil the session
+            sessions.add(session, frames[-1])
         return found if candidates else {key: found[key] for key in found if key != "candidates"}
 
     @app.delete("/sessions/{name}")
-    def forget(name: str) -> dict[str, bool]:  # pyright: ignore[reportUnusedFunction]
+    async def forget(name: str) -> dict[str, bool]:  # pyright: ignore[reportUnusedFunction]
         """Forget the frames of a session."""
-        return {"was_there": sessions.forget(name)}
+        return {"was_there": sessions.pop(name, None) is not None}
 
     return app
