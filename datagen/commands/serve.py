@@ -80,32 +80,34 @@ def app_of(given: ServeOptions) -> FastAPI:
     """The application. InputError for options that cannot be used."""
     from datagen.train.prediction import load_scorer
     from datagen.train.prediction.service import make_app
+    from datagen.worker_processes import WorkerProcesses
 
     token = None if given.token is None else _token(Path(given.token))
     if token is None and not _is_loopback(given.host):
         fix = "Give --token FILE, or listen on 127.0.0.1"
         raise InputError("--host", given.host, "is no loopback address, and there is no --token", fix)
-    ask_of(given)  # refuses files that cannot be used
-    return make_app(partial(ask_of, given), load_scorer(given.checkpoint).name, token)
+    answerer(given)  # refuses files that cannot be used
+    workers = WorkerProcesses(partial(answerer, given))
+    return make_app(workers.call, load_scorer(given.checkpoint).name, token)
 
 
-def ask_of(given: ServeOptions) -> Callable[[list[SensorFrame], dict[str, Any]], Prediction]:
-    """A function that answers for frames and options of a request."""
+def answerer(given: ServeOptions) -> Callable[..., dict[str, Any]]:
+    """A function that answers requests, in one process."""
     from datagen.train.prediction import load_scorer, read_map
+    from datagen.train.prediction.service import answer_of
     from datagen.train.program_scorer import ProgramScorer
 
-    scorer, sizes = load_scorer(given.checkpoint), ("robot", "base_height", "reach")
-    fixed: dict[str, Any] = {name: getattr(given, name) for name in sizes}
-    fixed |= {"map": [read_map(each) for each in given.map]}
+    scorer, own_maps = load_scorer(given.checkpoint), [read_map(each) for each in given.map]
+    fixed: dict[str, Any] = {name: getattr(given, name) for name in ("robot", "base_height", "reach")}
     fixed |= {"keep_out": [read_map(each) for each in given.keep_out]}
 
     def ask(frames: list[SensorFrame], options: dict[str, Any]) -> Prediction:
-        candidates = options.pop("candidates")
+        candidates, maps = options.pop("candidates"), [*options.pop("map"), *own_maps]
         if isinstance(scorer, ProgramScorer):
             scorer.only_clear = not candidates  # other scores are not shown
-        return predict(scorer, frame=frames, **fixed, **options)
+        return predict(scorer, frame=frames, map=maps, **fixed, **options)
 
-    return ask
+    return partial(answer_of, ask)
 
 
 def _token(path: Path) -> str:

@@ -35,12 +35,11 @@ class ProgramScorer:
     kept: of the same frame, another arrival error may be asked for.
     """
 
-    only_clear = False
-
-    def __init__(self, path: Path, name: str = "") -> None:
+    def __init__(self, path: Path, name: str = "", only_clear: bool = False) -> None:
         self.program = read_program(path)
         facts = self.program.facts
         self.name, self.threshold = f"{name}{facts['name']}", 0.5
+        self.only_clear, self.weights_sha256 = only_clear, facts["weights_sha256"]
         self.robots: dict[str, tuple[float, float]] = {k: (v[0], v[1]) for k, v in facts["robots"].items()}
         self.side_deg: float | None = facts["side_deg"]
         self._kept = dict[bytes, F64]()

@@ -2,35 +2,32 @@
 
 from __future__ import annotations
 
-import asyncio
 import hmac
-import multiprocessing
-import os
 import re
-import signal
 import tempfile
-import threading
 from collections import OrderedDict
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Awaitable, Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from fastapi import Depends, FastAPI, HTTPException, Query, Request
 
 from datagen import __version__
 from datagen.schemas.errors import InputError
 from datagen.train.prediction.answer import Prediction
+from datagen.train.prediction.files import read_arrays
 from datagen.train.prediction.frames import SensorFrame, read_place
+from datagen.train.prediction.goals import goal_document
+from datagen.train.prediction.occupancy import OccupancyMap, grid_map
 from datagen.train.prediction.prediction_report import document
 
 MOST_BYTES, MOST_SESSIONS, MOST_FRAMES = 64 << 20, 8, 6
 _BODY = "body.npz"
 
 Ask = Callable[[list[SensorFrame], dict[str, Any]], Prediction]  # of frames and options of a request
-_asks: list[Ask] = []  # the one of this worker process
+Answer = Callable[[list[bytes], dict[str, Any]], Awaitable[dict[str, Any]]]  # for bodies of frames
 
 
 class Sessions(OrderedDict[str, list[bytes]]):
@@ -43,53 +40,38 @@ class Sessions(OrderedDict[str, list[bytes]]):
             self.popitem(last=False)
 
 
-def _start(make_ask: Callable[[], Ask]) -> None:
-    """Set up a worker process, which ends with the service. Ctrl-C reaches both, and only that handles it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    service = multiprocessing.parent_process()
-    assert service is not None
-    threading.Thread(target=lambda: (service.join(), os._exit(1)), daemon=True).start()
-    _asks.append(make_ask())
-
-
 @lru_cache(maxsize=MOST_FRAMES)
-def _frame(body: bytes) -> SensorFrame:
+def _read(body: bytes) -> tuple[SensorFrame, list[OccupancyMap]]:
+    """The frame of a body, and the map that it has."""
     with tempfile.TemporaryDirectory() as folder:
         (file := Path(folder) / _BODY).write_bytes(body)
-        return read_place(file)
+        frame, arrays = read_place(file), read_arrays(file, ("intrinsics", "map", "map_pose"))
+        if "map" not in arrays:
+            return frame, []
+        grid, at = arrays["map"], arrays.get("map_pose", np.zeros(0))
+        if grid.dtype != np.int8 or grid.ndim != 2 or at.shape != (4,) or not 0.001 <= at[3] <= 1:
+            fix = "Give map (H, W) as int8, as in OccupancyGrid, and map_pose: x, y, yaw and resolution"
+            raise InputError(file, "map", "is no map", fix)
+        x, y, yaw, resolution_m = at.tolist()
+        return frame, [grid_map("map", grid, resolution_m, (x, y, yaw))]
 
 
-def _answer(bodies: list[bytes], options: dict[str, Any]) -> dict[str, Any]:
-    return document(_asks[0]([_frame(body) for body in bodies], options))
+def answer_of(ask: Ask, bodies: list[bytes], options: dict[str, Any]) -> dict[str, Any]:
+    """The document of an answer; `goal` has poses of the robot's base where the frames have poses."""
+    frames, maps = zip(*map(_read, bodies), strict=True)
+    found = ask(list(frames), options | {"map": maps[-1]})
+    return document(found) | {"goal": goal_document(found, "map", 0)}
 
 
-def make_app(make_ask: Callable[[], Ask], model: str, token: str | None) -> FastAPI:
-    """The application, with one worker process a core; with a token, requests must give it."""
-    sessions, pools, count = Sessions(), list[ProcessPoolExecutor](), len(os.sched_getaffinity(0))
-
-    def start_workers() -> None:
-        context = multiprocessing.get_context("spawn")
-        pools[:] = [ProcessPoolExecutor(count, context, _start, (make_ask,))]
-        for _ in range(count):
-            pools[0].submit(int)  # starts a process
+def make_app(answer: Answer, model: str, token: str | None) -> FastAPI:
+    """The application; with a token, requests must give it."""
+    sessions = Sessions()
 
     def allowed(request: Request) -> None:
         given = request.headers.get("authorization", "")
         if token is not None and not hmac.compare_digest(given.encode(), f"Bearer {token}".encode()):
             raise HTTPException(401, "give the token: Authorization: Bearer WORD")
 
-    async def answer(bodies: list[bytes], options: dict[str, Any]) -> dict[str, Any]:
-        pool = pools[0]
-        try:
-            return await asyncio.wrap_future(pool.submit(_answer, bodies, options))
-        except InputError as error:
-            raise HTTPException(422, re.sub(rf"\S*/{_BODY}", "the body", str(error))) from None
-        except BrokenProcessPool:
-            if pool is pools[0]:
-                start_workers()
-            raise HTTPException(503, "a worker process ended without a message: ask again") from None
-
-    start_workers()
     app = FastAPI(title="datagen", version=__version__, dependencies=[Depends(allowed)])
 
     @app.get("/health")
@@ -121,7 +103,10 @@ def make_app(make_ask: Callable[[], Ask], model: str, token: str | None) -> Fast
             "candidates": candidates,
         }
         frames = [*sessions.get(session or "", ()), bytes(data)][-MOST_FRAMES:]
-        found = await answer(frames, options)
+        try:
+            found = await answer(frames, options)
+        except InputError as error:
+            raise HTTPException(422, re.sub(rf"\S*/{_BODY}", "the body", str(error))) from None
         if session is not None:  # not before: a frame that cannot be read would spoil the session
             sessions.add(session, frames[-1])
         return found if candidates else {key: found[key] for key in found if key != "candidates"}
