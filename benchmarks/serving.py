@@ -2,11 +2,11 @@ r"""Requests a second that `datagen serve` answers, their latency, and what they
 
     python -m benchmarks.serving FRAME [--map map.yaml] [--robot fetch] [--cores 1 2] [--seconds 60]
 
-FRAME is a frame's folder with a pose and a mask. The service may use the first of this process's cores, and has
-one worker process on each. Two clients a core ask again as soon as they are answered. Requests are of three
-kinds: `frame`, with another frame each (noise of 1 mm on the depth); `target`, clicks on several things in one
-frame; `arrival`, one frame and target with several arrival errors. Memory (unshared, MiB) and CPU are those of
-all processes of the service, memory at the start after two requests a core.
+FRAME is a frame's folder with a pose and a mask. The service may use the first of this process's cores, and
+has one worker process on each. Two clients a core ask again as soon as they are answered. Requests are of
+three kinds: `frame`, with another frame each (noise of 1 mm on the depth); `target`, clicks into one frame;
+`arrival`, one frame and target with several arrival errors. Memory (unshared) and CPU are those of all
+processes of the service, memory at the start after eight requests a core.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ import psutil
 
 from datagen.train.prediction import read_place
 
-PORT, FRAMES, TARGETS = 8790, 24, 6
+PORT, FRAMES, TARGETS = 8790, 24, 12
 Call = tuple[bytes, str]  # a body and a query
 
 
@@ -63,7 +63,7 @@ def _measure(kind: str, cores: int, options: argparse.Namespace) -> None:
         try:
             _wait()
             calls = list(_calls(kind, options.frame))
-            for _, call in zip(range(2 * cores), cycle(calls)):
+            for _, call in zip(range(8 * cores), cycle(calls)):
                 _ask(call)
             processes = [psutil.Process(service.pid), *psutil.Process(service.pid).children(recursive=True)]
             memory, cpu_s, begun_s = _memory(processes), _cpu_s(processes), time.monotonic()

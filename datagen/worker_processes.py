@@ -28,6 +28,12 @@ class WorkerProcesses:
         for _ in range(count):
             self._pool.submit(int)  # starts a process
 
+    async def __aenter__(self) -> None:
+        """They run from the first on."""
+
+    async def __aexit__(self, *_: object) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
     async def call(self, *args: Any) -> Any:
         """The function's result. BrokenProcessPool where a process ended; new ones answer the next call."""
         pool = self._pool

@@ -88,7 +88,7 @@ def app_of(given: ServeOptions) -> FastAPI:
         raise InputError("--host", given.host, "is no loopback address, and there is no --token", fix)
     answerer(given)  # refuses files that cannot be used
     workers = WorkerProcesses(partial(answerer, given))
-    return make_app(workers.call, load_scorer(given.checkpoint).name, token)
+    return make_app(workers, load_scorer(given.checkpoint).name, token)
 
 
 def answerer(given: ServeOptions) -> Callable[..., dict[str, Any]]:

@@ -31,7 +31,7 @@ from datagen.train.baselines.scalars import Scalars
 from datagen.train.headings import refuse_other_heading, side_deg_of, trained_side_deg
 from datagen.train.program_scorer import ProgramScorer
 from datagen.train.run_parts import read_robots, specs_of
-from datagen.train.scorers import ModelScorer, Scorer
+from datagen.train.scorers import ModelScorer, Scorer, weights_sha256
 from datagen.train.splits import refuse_shared_houses
 from datagen.workers.extras import EXTRAS, how_to_get
 from datagen.workers.robots import ROBOTS
@@ -117,12 +117,16 @@ class EvaluatedMethod:
         }
         if self.head is None:
             return {**base, "checkpoint": None, "state": dict(self.state)}
-        assert isinstance(self.scorer, (ModelScorer, ProgramScorer))
+        scorer = self.scorer
+        assert isinstance(scorer, (ModelScorer, ProgramScorer))
+
         kept = ("model", "stage", "data", "best_epoch", "finished", "cost", "init")
         checkpoint = {
             "file": Path(self.place).name,
             "sha256": self.head.digest,
-            "weights_sha256": self.scorer.weights_sha256,
+            "weights_sha256": scorer.weights_sha256
+            if isinstance(scorer, ProgramScorer)
+            else weights_sha256(scorer.model),
             "config": self.head.model_config,
             **{name: getattr(self.head, name) for name in kept},
         }

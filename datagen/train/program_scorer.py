@@ -54,8 +54,7 @@ class ProgramScorer:
                 rows = np.flatnonzero(wanted & (batch.candidates.robot_row == k))
                 if len(rows):
                     found[rows] = self._of_robot(batch, k, rows)
-        others = [each for each in self._kept.items() if each[0] != key]
-        self._kept = dict([*others[-_MOST_KEPT:], (key, found)])
+        self._kept = dict([*self._kept.items()][-_MOST_KEPT:]) | {key: found}
         return found.copy()
 
     def _of_robot(self, batch: Batch[Array], k: int, rows: Array) -> F64:

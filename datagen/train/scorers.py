@@ -45,10 +45,6 @@ class ModelScorer:
     robots: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
     side_deg: float | None = 0.0
 
-    @property
-    def weights_sha256(self) -> str:
-        return weights_sha256(self.model)
-
     def score(self, batch: Batch[Array]) -> F64:
         """Probabilities (N,); the model divides the candidates to bound memory.
 

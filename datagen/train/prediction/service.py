@@ -6,7 +6,7 @@ import hmac
 import re
 import tempfile
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,12 +22,12 @@ from datagen.train.prediction.frames import SensorFrame, read_place
 from datagen.train.prediction.goals import goal_document
 from datagen.train.prediction.occupancy import OccupancyMap, grid_map
 from datagen.train.prediction.prediction_report import document
+from datagen.worker_processes import WorkerProcesses
 
 MOST_BYTES, MOST_SESSIONS, MOST_FRAMES = 64 << 20, 8, 6
 _BODY = "body.npz"
 
 Ask = Callable[[list[SensorFrame], dict[str, Any]], Prediction]  # of frames and options of a request
-Answer = Callable[[list[bytes], dict[str, Any]], Awaitable[dict[str, Any]]]  # for bodies of frames
 
 
 class Sessions(OrderedDict[str, list[bytes]]):
@@ -49,7 +49,8 @@ def _read(body: bytes) -> tuple[SensorFrame, list[OccupancyMap]]:
         if "map" not in arrays:
             return frame, []
         grid, at = arrays["map"], arrays.get("map_pose", np.zeros(0))
-        if grid.dtype != np.int8 or grid.ndim != 2 or at.shape != (4,) or not 0.001 <= at[3] <= 1:
+        sound = grid.dtype == np.int8 and grid.ndim == 2 and at.shape == (4,)
+        if not (sound and (np.abs(at[:3]) < 1e5).all() and 0.001 <= at[3] <= 1):
             fix = "Give map (H, W) as int8, as in OccupancyGrid, and map_pose: x, y, yaw and resolution"
             raise InputError(file, "map", "is no map", fix)
         x, y, yaw, resolution_m = at.tolist()
@@ -63,8 +64,8 @@ def answer_of(ask: Ask, bodies: list[bytes], options: dict[str, Any]) -> dict[st
     return document(found) | {"goal": goal_document(found, "map", 0)}
 
 
-def make_app(answer: Answer, model: str, token: str | None) -> FastAPI:
-    """The application; with a token, requests must give it."""
+def make_app(workers: WorkerProcesses, model: str, token: str | None) -> FastAPI:
+    """The application, for workers that call `answer_of`; with a token, requests must give it."""
     sessions = Sessions()
 
     def allowed(request: Request) -> None:
@@ -72,7 +73,8 @@ def make_app(answer: Answer, model: str, token: str | None) -> FastAPI:
         if token is not None and not hmac.compare_digest(given.encode(), f"Bearer {token}".encode()):
             raise HTTPException(401, "give the token: Authorization: Bearer WORD")
 
-    app = FastAPI(title="datagen", version=__version__, dependencies=[Depends(allowed)])
+    rules = [Depends(allowed)]
+    app = FastAPI(title="datagen", version=__version__, dependencies=rules, lifespan=lambda _: workers)
 
     @app.get("/health")
     async def health() -> dict[str, Any]:  # pyright: ignore[reportUnusedFunction]
@@ -104,7 +106,7 @@ def make_app(answer: Answer, model: str, token: str | None) -> FastAPI:
         }
         frames = [*sessions.get(session or "", ()), bytes(data)][-MOST_FRAMES:]
         try:
-            found = await answer(frames, options)
+            found = await workers.call(frames, options)
         except InputError as error:
             raise HTTPException(422, re.sub(rf"\S*/{_BODY}", "the body", str(error))) from None
         if session is not None:  # not before: a frame that cannot be read would spoil the session
