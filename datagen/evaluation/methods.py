@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 from safetensors import safe_open
@@ -239,15 +239,15 @@ def _model(path: str) -> tuple[str, ModelScorer, CheckpointHead]:
     from datagen.train.training.checkpoints import load_model
 
     model, head = load_model(path)
-    return Path(path).stem, ModelScorer(model, Path(path).stem, only_clear=True), head
+    return Path(path).stem, ModelScorer(model, path, only_clear=True), head
 
 
 def _released() -> tuple[str, ProgramScorer, CheckpointHead]:
     """The released model as a program, and its checkpoint's metadata, both without torch."""
     file = released_checkpoint()
     document = json.loads(safe_open(file, "numpy").metadata()["head"])
-    head = SimpleNamespace(**document["head"], digest=hashlib.sha256(file.read_bytes()).hexdigest())
-    return RELEASED, ProgramScorer(released_program(), only_clear=True), cast("CheckpointHead", head)
+    head: Any = SimpleNamespace(**document["head"], digest=hashlib.sha256(file.read_bytes()).hexdigest())
+    return RELEASED, ProgramScorer(released_program(), only_clear=True), head
 
 
 def open_methods(

@@ -98,9 +98,9 @@ def observe_cells(
         around = map_corners(base_xy, seen.eyes_m)
         free, occupied = (np.insert(xy, 2, 0.0, axis=1).astype(np.float32) for xy in known.points(*around))
         low_points, floor = np.concatenate([low_points, occupied]), np.concatenate([floor, free])
-    high = _crowded(tops, base_xy, yaw, Footprint(params.mast_radius_m))
+    high = crowded_bases(tops, base_xy, yaw, Footprint(params.mast_radius_m))
     turns = (-2 * yaw_error_rad, 0.0, 2 * yaw_error_rad) if yaw_error_rad and base.corners_m else (0.0,)
-    low = np.any([_crowded(low_points, base_xy, yaw + turn, base) for turn in turns], axis=0)
+    low = np.any([crowded_bases(low_points, base_xy, yaw + turn, base) for turn in turns], axis=0)
     blocked = low | high | _in_shadow(tops, base_xy)
     share = _floor_share(floor, base_xy, yaw, base)
     way = ways_to(
@@ -127,7 +127,7 @@ def seen_share(cloud_m: F32, radius_m: float) -> float:
     return float(hit[np.hypot(*np.meshgrid(centres, centres)) <= radius_m].mean())
 
 
-def _crowded(points_m: F32, base_xy: F64, yaw: F64, base: Footprint) -> Bools:
+def crowded_bases(points_m: F32, base_xy: F64, yaw: F64, base: Footprint) -> Bools:
     """Mask (N,) of bases that have `_LEAST_POINTS` points (N, 3) in their outline, seen from above."""
     low = base_xy.mean(axis=0) - _AROUND_M
     n = int(np.ceil(2 * _AROUND_M / _THIN_M))
