@@ -17,7 +17,6 @@ from datagen.train.headings import refuse_other_heading, trained_side_deg
 from datagen.train.inputs import F64, Array, Batch, CandidateInputs, Clouds, RobotInputs
 from datagen.train.prediction.answer import CROP, Prediction
 from datagen.train.prediction.base_cells import (
-    BLOCKED,
     CLEAR,
     STATES,
     UNSEEN,
@@ -200,7 +199,7 @@ def _grid(cells: int, half_width_m: float) -> CandidateParams:
 
 
 def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, cells: BaseCells) -> Batch[Array]:
-    """The base poses as input of a scorer; `base_is_clear` is false where a base pose is blocked."""
+    """The base poses as input of a scorer; `base_is_clear` is false where it cannot stand or get to."""
     n = len(cells.offset_m)
 
     def one(value: float) -> Array:
@@ -227,7 +226,7 @@ def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, cells: BaseCells) 
         ),
         np.zeros(n, np.int64),
         np.zeros((n, 16), np.uint8),
-        {"base_is_clear": cells.state != STATES.index(BLOCKED)},
+        {"base_is_clear": np.isin(cells.state, (STATES.index(CLEAR), STATES.index(UNSEEN)))},
     )
 
 
