@@ -9,8 +9,8 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from datagen.schemas.fields import facing_rad
 from datagen.schemas.specification import CandidateParams
-from datagen.schemas.stored_arrays import facing_rad
 from datagen.train.arrivals import Arrival, expected_success, stands, tolerance_m
 from datagen.train.inputs import F32, F64, I64, Bools
 from datagen.train.prediction.floor_ways import CELL_M, WAYS, counted, draw_map, map_corners, ways_to
