@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ipaddress
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +22,9 @@ from datagen.schemas.safe_files import read_regular
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
+
+    from datagen.train.prediction import Prediction
+    from datagen.train.prediction.frames import SensorFrame
 
 _UNSET = Parameter(show_default=False)
 
@@ -64,6 +69,7 @@ def serve(given: ServeOptions) -> None:
     """
     import uvicorn
 
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # of the worker processes
     app = app_of(given)
     with Progress() as shown:
         shown.phase(f"listening on http://{given.host}:{given.port}, described at /docs")
@@ -72,20 +78,36 @@ def serve(given: ServeOptions) -> None:
 
 def app_of(given: ServeOptions) -> FastAPI:
     """The application. InputError for options that cannot be used."""
-    from datagen.train.prediction import load_scorer, read_map
+    from datagen.train.prediction import load_scorer
     from datagen.train.prediction.service import make_app
+    from datagen.worker_processes import WorkerProcesses
 
     token = None if given.token is None else _token(Path(given.token))
     if token is None and not _is_loopback(given.host):
         fix = "Give --token FILE, or listen on 127.0.0.1"
         raise InputError("--host", given.host, "is no loopback address, and there is no --token", fix)
-    scorer, sizes = load_scorer(given.checkpoint), ("robot", "base_height", "reach")
-    fixed: dict[str, Any] = {name: getattr(given, name) for name in sizes}
-    fixed |= {"map": [read_map(each) for each in given.map]}
+    answerer(given)  # refuses files that cannot be used
+    workers = WorkerProcesses(partial(answerer, given))
+    return make_app(workers, load_scorer(given.checkpoint).name, token)
+
+
+def answerer(given: ServeOptions) -> Callable[..., dict[str, Any]]:
+    """A function that answers requests, in one process."""
+    from datagen.train.prediction import load_scorer, read_map
+    from datagen.train.prediction.service import answer_of
+    from datagen.train.program_scorer import ProgramScorer
+
+    scorer, own_maps = load_scorer(given.checkpoint), [read_map(each) for each in given.map]
+    fixed: dict[str, Any] = {name: getattr(given, name) for name in ("robot", "base_height", "reach")}
     fixed |= {"keep_out": [read_map(each) for each in given.keep_out]}
-    return make_app(
-        lambda frames, options: predict(scorer, frame=frames, **fixed, **options), scorer.name, token
-    )
+
+    def ask(frames: list[SensorFrame], options: dict[str, Any]) -> Prediction:
+        candidates, maps = options.pop("candidates"), [*options.pop("map"), *own_maps]
+        if isinstance(scorer, ProgramScorer):
+            scorer.only_clear = not candidates  # other scores are not shown
+        return predict(scorer, frame=frames, map=maps, **fixed, **options)
+
+    return partial(answer_of, ask)
 
 
 def _token(path: Path) -> str:

@@ -15,8 +15,8 @@ from scipy.spatial import KDTree
 
 from datagen.evaluation.columns import Columns
 from datagen.evaluation.comparisons import Method
+from datagen.schemas.fields import facing_rad
 from datagen.schemas.specification import DECISIVE_SHARES
-from datagen.schemas.stored_arrays import facing_rad
 from datagen.train.arrivals import Arrival, expected_success, ring_arrival, stands
 from datagen.train.bootstrap import Estimate, Weights, summed
 from datagen.train.inputs import F64, Bools, Ints

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
+from safetensors import safe_open
 
 from datagen.configuration.toml_files import first_of, read_toml
 from datagen.display.progress import counting, steps
@@ -17,7 +21,7 @@ from datagen.evaluation.columns import Columns, gather
 from datagen.evaluation.comparisons import NO_TRAINING, Method, TrainedBy
 from datagen.evaluation.runs import EvaluatedRun, refuse_no_trials, stream_of
 from datagen.evaluation.score_files import ScoreFile, read_scores
-from datagen.released import RELEASED, released_checkpoint
+from datagen.released import RELEASED, released_checkpoint, released_program
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
 from datagen.schemas.specification import HeuristicParams
@@ -25,6 +29,7 @@ from datagen.train.baselines import BASELINES, fit_baselines, make_baselines
 from datagen.train.baselines.baseline import Calibration, calibrate
 from datagen.train.baselines.scalars import Scalars
 from datagen.train.headings import refuse_other_heading, side_deg_of, trained_side_deg
+from datagen.train.program_scorer import ProgramScorer
 from datagen.train.run_parts import read_robots, specs_of
 from datagen.train.scorers import ModelScorer, Scorer, weights_sha256
 from datagen.train.splits import refuse_shared_houses
@@ -85,7 +90,7 @@ class EvaluatedMethod:
     @property
     def method(self) -> Method:
         """The method for the metrics."""
-        is_probability = isinstance(self.scorer, (ModelScorer, Scalars)) or (
+        is_probability = isinstance(self.scorer, (ModelScorer, ProgramScorer, Scalars)) or (
             isinstance(self.scorer, ScoreFile) and self.scorer.gives_probabilities
         )
         return Method(
@@ -112,12 +117,16 @@ class EvaluatedMethod:
         }
         if self.head is None:
             return {**base, "checkpoint": None, "state": dict(self.state)}
-        assert isinstance(self.scorer, ModelScorer)
+        scorer = self.scorer
+        assert isinstance(scorer, (ModelScorer, ProgramScorer))
+
         kept = ("model", "stage", "data", "best_epoch", "finished", "cost", "init")
         checkpoint = {
             "file": Path(self.place).name,
             "sha256": self.head.digest,
-            "weights_sha256": weights_sha256(self.scorer.model),
+            "weights_sha256": scorer.weights_sha256
+            if isinstance(scorer, ProgramScorer)
+            else weights_sha256(scorer.model),
             "config": self.head.model_config,
             **{name: getattr(self.head, name) for name in kept},
         }
@@ -214,21 +223,31 @@ def open_models(paths: Sequence[str], runs: Sequence[EvaluatedRun] = ()) -> list
 
     InputError where bases of `runs` stand to the target otherwise than those that one was trained on.
     """
-    if not paths:
-        return []
-    from datagen.train.training.checkpoints import load_model
-
     found: list[EvaluatedMethod] = []
     for path in paths:
-        model, head = load_model(path)
+        name, scorer, head = _released() if path == str(released_checkpoint()) else _model(path)
         other_deg = trained_side_deg(head)
         if other_deg is None:
             read_robots(summary.part for run in runs for summary in run.stream.parts)
         for place, spec in ((run.place, spec) for run in runs for spec in run.specs):
             refuse_other_heading(place, "candidates.yaw_rad", side_deg_of(spec), path, other_deg)
-        name = RELEASED if path == str(released_checkpoint()) else Path(path).stem
-        found.append(EvaluatedMethod(name, ModelScorer(model, name, only_clear=True), path, head))
+        found.append(EvaluatedMethod(name, scorer, path, head))
     return found
+
+
+def _model(path: str) -> tuple[str, ModelScorer, CheckpointHead]:
+    from datagen.train.training.checkpoints import load_model
+
+    model, head = load_model(path)
+    return Path(path).stem, ModelScorer(model, path, only_clear=True), head
+
+
+def _released() -> tuple[str, ProgramScorer, CheckpointHead]:
+    """The released model as a program, and its checkpoint's metadata, both without torch."""
+    file = released_checkpoint()
+    document = json.loads(safe_open(file, "numpy").metadata()["head"])
+    head: Any = SimpleNamespace(**document["head"], digest=hashlib.sha256(file.read_bytes()).hexdigest())
+    return RELEASED, ProgramScorer(released_program(), only_clear=True), head
 
 
 def open_methods(

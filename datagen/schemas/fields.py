@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from datagen.schemas.errors import InputError, choices
 from datagen.schemas.specification import PLACE_KINDS, Specification
@@ -287,3 +288,8 @@ def sized_schema(name: str, spec: Specification, version: int = SCHEMA_VERSION) 
         .of_version(version)
         .sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter, **joints)
     )
+
+
+def facing_rad(towards_m: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    """Headings (...,) along vectors (..., 2), counter-clockwise from x."""
+    return np.arctan2(towards_m[..., 1], towards_m[..., 0], dtype=np.float64)

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import SCHEMAS, SceneRows
+from datagen.schemas.fields import SCHEMAS, SceneRows, facing_rad
 from datagen.schemas.run import Rows, Run
 from datagen.schemas.run_records import Commit
 from datagen.schemas.safe_files import DAMAGED_ZIP
@@ -29,7 +29,6 @@ from datagen.schemas.stored_arrays import (
     Array,
     StoredArray,
     decode_chunk,
-    facing_rad,
     has_crc32c,
     parse_metadata,
     readable,

@@ -136,11 +136,6 @@ def _computed(name: str, stored: Mapping[str, StoredArray]) -> StoredArray:
     return replace(like, dtype=field.dtype, attributes=field_attributes(field), computed_from=sources)
 
 
-def facing_rad(towards_m: Array) -> npt.NDArray[np.float64]:
-    """Headings (...,) along vectors (..., 2), counter-clockwise from x."""
-    return np.arctan2(towards_m[..., 1], towards_m[..., 0], dtype=np.float64)
-
-
 def decode_chunk(place: str, array: StoredArray, data: bytes) -> Array:
     """Decode a chunk's values, (chunk_rows, ...). InputError naming `place` for damaged bytes."""
     packed = data[:-4]

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.stored_arrays import facing_rad
+from datagen.schemas.fields import facing_rad
 from datagen.train.inputs import (
     F32,
     F64,

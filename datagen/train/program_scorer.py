@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 
 from datagen.train.hands.poses import poses_of_clouds
 from datagen.train.hands.reach import hand_reach, hands_of
-from datagen.train.inputs import F32, F64, Array, Batch, CandidateInputs
+from datagen.train.inputs import F32, F64, Array, Batch, CandidateInputs, is_clear
 from datagen.train.observed_visibility import visible_share
 from datagen.train.programs import read_program
 
@@ -21,29 +22,40 @@ AT_ONCE = 125  # candidates in one call; 625 are a grid
 CLOUD = ("points_m", "rgb", "mask", "count", "height_m", "base_height_m", "reach_m")
 TOKENS = ("same", "left", "centres_m", "valid", "numbers", "vectors", "tensors", "radius_m", "rise_m")
 TO_SCORE = ("camera_rise_m", "reach_m", "poses", "base_xy_m", "rho", "codes")
+_MOST_KEPT = 7  # other batches
 _MIN_REACH_M = np.float32(0.05)
 T = TypeVar("T")
 Arrays = Mapping[str, Array]
 
 
 class ProgramScorer:
-    """A scorer, as `ModelScorer` of the model of which the program was made. InputError for another file."""
+    """A scorer, as `ModelScorer` of the model of which the program was made. InputError for another file.
 
-    def __init__(self, path: Path, name: str = "") -> None:
+    With `only_clear` the score of a base that is not clear is 0, without computing it. The latest scores are
+    kept: of the same frame, another arrival error may be asked for.
+    """
+
+    def __init__(self, path: Path, name: str = "", only_clear: bool = False) -> None:
         self.program = read_program(path)
         facts = self.program.facts
         self.name, self.threshold = f"{name}{facts['name']}", 0.5
+        self.only_clear, self.weights_sha256 = only_clear, facts["weights_sha256"]
         self.robots: dict[str, tuple[float, float]] = {k: (v[0], v[1]) for k, v in facts["robots"].items()}
         self.side_deg: float | None = facts["side_deg"]
+        self._kept = dict[bytes, F64]()
 
     def score(self, batch: Batch[Array]) -> F64:
         """Probabilities (N,)."""
-        found = np.empty(len(batch))
-        for k in range(len(batch.robots)):
-            rows = np.flatnonzero(batch.candidates.robot_row == k)
-            if len(rows):
-                found[rows] = self._of_robot(batch, k, rows)
-        return found
+        wanted = is_clear(batch) if self.only_clear else np.ones(len(batch), np.bool_)
+        key = pickle.dumps((batch.clouds, batch.robots, batch.candidates, wanted))
+        if (found := self._kept.get(key)) is None:
+            found = np.zeros(len(batch))
+            for k in range(len(batch.robots)):
+                rows = np.flatnonzero(wanted & (batch.candidates.robot_row == k))
+                if len(rows):
+                    found[rows] = self._of_robot(batch, k, rows)
+        self._kept = dict([*self._kept.items()][-_MOST_KEPT:]) | {key: found}
+        return found.copy()
 
     def _of_robot(self, batch: Batch[Array], k: int, rows: Array) -> F64:
         robot = _rows(batch.robots, np.array([k]))
@@ -60,12 +72,8 @@ class ProgramScorer:
         tokens: dict[str, Array] = dict(zip(TOKENS, self.program.run(ENCODE, of_cloud), strict=True))
         n_poses, hands = int(self.program.facts["hand_poses"]), hands_of(robot, 1)
         poses = poses_of_clouds(cloud.points_m, cloud.target_mask, cloud.n_points, n_poses, hands)
-        shared = {
-            **tokens,
-            "camera_rise_m": camera_rise_m,
-            "reach_m": np.maximum(robot.arm_reach_m, _MIN_REACH_M),
-            "poses": poses,
-        }
+        reach_m = np.maximum(robot.arm_reach_m, _MIN_REACH_M)
+        shared = tokens | {"camera_rise_m": camera_rise_m, "reach_m": reach_m, "poses": poses}
         rho = _visible_share(of_cloud, tokens, candidates, float(camera_rise_m[0]))
         codes = hand_reach(poses, robot, candidates, tokens["rise_m"])
         logits: list[F32] = []

@@ -8,6 +8,7 @@ outputs and the steps of each of its functions, which are operations of PyTorch'
 from __future__ import annotations
 
 import json
+import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -152,11 +153,11 @@ def _pad(x: Array, pad: Sequence[int], value: float = 0.0) -> Array:
 
 
 def _layer_norm(x: Array, shape: Sequence[int], weight: Array, bias: Array, eps: float) -> tuple[Array, ...]:
-    axes = tuple(range(x.ndim - len(shape), x.ndim))
-    away = x - x.mean(axis=axes, keepdims=True)
-    scale = 1 / np.sqrt((away * away).mean(axis=axes, keepdims=True) + eps)
-    away *= scale
-    away *= weight
+    # A product with ones is several times as fast as a mean along short rows.
+    away = x.reshape(-1, size := math.prod(shape))
+    away = away - away @ np.full((size, 1), 1 / size, away.dtype)
+    away *= 1 / np.sqrt(np.einsum("ij,ij->i", away, away)[:, None] / size + eps)
+    away = away.reshape(x.shape) * weight
     away += bias
     return (away,)
 

@@ -55,7 +55,7 @@ EXTRAS: dict[str, Extra] = {
         },
     ),
     "predict": Extra(
-        "predict with the released model, benchmark score of files of scores and of rules",
+        "predict with the released model, benchmark score of it, of files of scores and of rules",
         {"safetensors": "safetensors", "yaml": "pyyaml", **_PICTURES},
     ),
     "serve": Extra("serve", {"fastapi": "fastapi", "uvicorn": "uvicorn"}),

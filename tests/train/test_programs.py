@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from datagen import released
 from datagen.evaluation.benchmark import present_runs, read_benchmark, shipped_pack
 from datagen.evaluation.runs import stream_of
 from datagen.schemas.errors import InputError
+from datagen.train.inputs import Array, Batch
 from datagen.train.program_scorer import ProgramScorer
 from datagen.train.programs import read_program
 from datagen.train.scorers import ModelScorer
@@ -52,6 +54,31 @@ def test_the_released_program_scores_the_pack_as_its_model_does(scenes: int) -> 
             if scenes < 100:
                 break
     assert seen > 90
+
+
+def first_batch() -> Batch[Array]:
+    runs = present_runs(str(shipped_pack()), read_benchmark(shipped_pack()))
+    return next(iter(stream_of([next(iter(runs.values()))]).epoch(0)))
+
+
+def test_only_clear_bases_are_scored_where_that_is_asked() -> None:
+    batch = first_batch()
+    clear = np.random.default_rng(0).random(len(batch)) < 0.5
+    batch = replace(batch, extra={"base_is_clear": clear})
+    full = ProgramScorer(released.released_program()).score(batch)
+    score = ProgramScorer(released.released_program(), only_clear=True).score(batch)
+    np.testing.assert_allclose(score, np.where(clear, full, 0.0), atol=1e-6)
+
+
+def test_the_scores_of_equal_batches_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    batch, scorer = first_batch(), ProgramScorer(released.released_program())
+    score = scorer.score(batch)
+    score[0] = -1.0  # a caller's own
+    turned = replace(batch.candidates, turn_rad=np.ones(len(batch), np.float32))
+    monkeypatch.setattr(type(scorer), "_of_robot", lambda *_: 2.0)
+    again = scorer.score(replace(batch, clouds=replace(batch.clouds)))
+    assert again[0] >= 0 and (again[1:] == score[1:]).all() and again.max() <= 1
+    assert (scorer.score(replace(batch, candidates=turned)) == 2.0).all()
 
 
 def test_prediction_needs_neither_torch_nor_a_compiler() -> None:

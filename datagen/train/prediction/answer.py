@@ -82,12 +82,12 @@ class Prediction:
         """The target's centre (3,)."""
         return np.array(self.target.center_m)
 
-    @property
+    @cached_property
     def base_xy_m(self) -> F64:
         """Base positions (N, 2)."""
         return self.center_m[:2] + self.cells.offset_m
 
-    @property
+    @cached_property
     def yaw_rad(self) -> F64:
         """Headings (N,), counter-clockwise from x: towards the target, or with the robot's side to it."""
         return headings(self.cells.offset_m, self.robot)

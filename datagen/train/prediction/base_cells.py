@@ -9,8 +9,8 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from datagen.schemas.fields import facing_rad
 from datagen.schemas.specification import CandidateParams
-from datagen.schemas.stored_arrays import facing_rad
 from datagen.train.arrivals import Arrival, expected_success, stands, tolerance_m
 from datagen.train.inputs import F32, F64, I64, Bools
 from datagen.train.prediction.floor_ways import CELL_M, WAYS, counted, draw_map, map_corners, ways_to
@@ -87,8 +87,8 @@ def observe_cells(
     offsets, base = grid_offsets(params), robot.outline
     base_xy, yaw = center_m[:2] + offsets, headings(offsets.astype(np.float32), robot)
     z = seen.points_m[:, 2]
-    gap_m = np.min([distances_m(seen.points_m, eye) for eye in seen.eyes_m], axis=0)
-    is_floor = np.any([floor_points(seen.points_m, eye) for eye in seen.eyes_m], axis=0)
+    gap_m = np.minimum.reduce([distances_m(seen.points_m, eye) for eye in seen.eyes_m])
+    is_floor = np.logical_or.reduce([floor_points(seen.points_m, eye) for eye in seen.eyes_m])
     above = (z > STEP_M + 2 * depth_error_m(gap_m)) & ~is_floor
     mount, top = robot.base_height_m, max(robot.camera_height_m, robot.base_height_m)
     low_points = seen.points_m[above & (z < mount + _BOARD_M)]
@@ -98,10 +98,10 @@ def observe_cells(
         around = map_corners(base_xy, seen.eyes_m)
         free, occupied = (np.insert(xy, 2, 0.0, axis=1).astype(np.float32) for xy in known.points(*around))
         low_points, floor = np.concatenate([low_points, occupied]), np.concatenate([floor, free])
-    high = _counts(tops, base_xy, yaw, Footprint(params.mast_radius_m))
+    high = crowded_bases(tops, base_xy, yaw, Footprint(params.mast_radius_m))
     turns = (-2 * yaw_error_rad, 0.0, 2 * yaw_error_rad) if yaw_error_rad and base.corners_m else (0.0,)
-    low = np.max([_counts(low_points, base_xy, yaw + turn, base) for turn in turns], axis=0)
-    blocked = (low >= _LEAST_POINTS) | (high >= _LEAST_POINTS) | _in_shadow(tops, base_xy)
+    low = np.any([crowded_bases(low_points, base_xy, yaw + turn, base) for turn in turns], axis=0)
+    blocked = low | high | _in_shadow(tops, base_xy)
     share = _floor_share(floor, base_xy, yaw, base)
     way = ways_to(
         draw_map(base_xy, seen.eyes_m, low_points, tops, floor),
@@ -127,26 +127,28 @@ def seen_share(cloud_m: F32, radius_m: float) -> float:
     return float(hit[np.hypot(*np.meshgrid(centres, centres)) <= radius_m].mean())
 
 
-def _counts(points_m: F32, base_xy: F64, yaw: F64, base: Footprint) -> I64:
-    """Number of points (N, 3) in the outline of each base, seen from above."""
-    near = np.abs(points_m[:, :2] - base_xy.mean(axis=0)).max(axis=1, initial=0) < _AROUND_M
-    xy = points_m[near, :2].astype(np.float64)
+def crowded_bases(points_m: F32, base_xy: F64, yaw: F64, base: Footprint) -> Bools:
+    """Mask (N,) of bases that have `_LEAST_POINTS` points (N, 3) in their outline, seen from above."""
     low = base_xy.mean(axis=0) - _AROUND_M
     n = int(np.ceil(2 * _AROUND_M / _THIN_M))
-    counts = counted(xy, low, _THIN_M, (n, n)).ravel()
+    counts = counted(points_m, low, _THIN_M, (n, n)).ravel()
     cells = np.flatnonzero(counts)
     if not len(cells):
-        return np.zeros(len(base_xy), np.int64)
+        return np.zeros(len(base_xy), np.bool_)
     thin, weight = low + _THIN_M * (np.column_stack(np.divmod(cells, n)) + 0.5), counts[cells]
-    found = KDTree(thin).query_ball_point(base_xy, base.radius_m)
-    row = np.repeat(np.arange(len(base_xy)), [len(rows) for rows in found])
+    tree = KDTree(thin, compact_nodes=False, balanced_tree=False)  # built faster
+    # Every outline holds this circle: few bases are left whose points must be counted one by one.
+    crowded = tree.query_ball_point(base_xy, base.inner_radius_m, return_length=True) >= _LEAST_POINTS
+    left = np.flatnonzero(~crowded)
+    found = tree.query_ball_point(base_xy[left], base.radius_m)
+    row = np.repeat(left, [len(rows) for rows in found])
     point = np.concatenate([*found, np.empty(0)]).astype(np.int64)
     if base.corners_m:
         rel, c, s = thin[point] - base_xy[row], np.cos(yaw[row]), np.sin(yaw[row])
         # Most points are in many outlines: all pairs are tested at once.
         inside = base.holds(np.column_stack([c * rel[:, 0] + s * rel[:, 1], c * rel[:, 1] - s * rel[:, 0]]))
         row, point = row[inside], point[inside]
-    return np.bincount(row, weight[point], len(base_xy)).astype(np.int64)
+    return crowded | (np.bincount(row, weight[point], len(base_xy)) >= _LEAST_POINTS)
 
 
 def _turned(points_m: F64, yaw: F64) -> F64:

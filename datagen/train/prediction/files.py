@@ -121,10 +121,10 @@ def scaled_depth(depth: Array, scale: float | None, place: str | Path) -> tuple[
         fix = f"Give --depth-scale {' or '.join(likely)}" if likely else "Check the camera's depth stream"
         problem = f"has a median of {metres:.4g} m at {step_m:g} m a step ({why})"
         raise InputError(place, "depth", problem, fix)
-    note = f"depth was read in steps of {step_m:g} m ({why}): median {metres:.2f} m"
+    note = f"depth was taken to be in steps of {step_m:g} m ({why}): median {metres:.2f} m"
     with np.errstate(over="ignore", invalid="ignore"):
         depth_m = valid_depth((depth.astype(np.float64) * step_m).astype(np.float32))
-    return depth_m, step_m, () if scale is not None or step_m == 1 else (note,)
+    return depth_m, step_m, () if scale is not None or whole or step_m == 1 else (note,)
 
 
 def valid_depth(depth_m: F32) -> F32:

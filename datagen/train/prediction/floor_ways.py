@@ -110,9 +110,10 @@ def ways_to(
 
 def counted(points_m: F32 | F64, low: F64, cell_m: float, size: tuple[int, int]) -> I64:
     """Number of points (N, 2 or more) in each cell (size) of a floor grid with its corner at `low` (2,)."""
-    cells = np.floor((points_m[:, :2] - low) / cell_m).astype(np.int64)
-    x, y = cells[((cells >= 0) & (cells < size)).all(axis=1)].T
-    return np.bincount(x * size[1] + y, minlength=size[0] * size[1]).reshape(size)
+    # By columns: reductions along short rows cost more than all else here.
+    x, y = (np.floor((points_m[:, k] - low[k]) / cell_m).astype(np.int64) for k in range(2))
+    inside = (x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1])
+    return np.bincount((x * size[1] + y)[inside], minlength=size[0] * size[1]).reshape(size)
 
 
 def _crowded(points_m: F32, low: F64, size: tuple[int, int]) -> Bools:
@@ -165,7 +166,7 @@ def _sights(points_m: F32, eyes_m: F64) -> tuple[list[F64], list[_Ends]]:
         rel = points_m[:, :2] - eye[:2].astype(np.float32)
         gap = np.hypot(rel[:, 0], rel[:, 1])
         bearing = _bearing(rel)
-        order = np.lexsort([gap, bearing])
+        order = np.argsort(bearing * 1024.0 + gap)  # by bearing, then by distance
         bearing, gap, z = bearing[order], gap[order], points_m[order, 2]
         first = np.searchsorted(bearing, np.arange(_BEARINGS + 1))
         near, far, wall = np.zeros(_BEARINGS), np.zeros(_BEARINGS), np.zeros(_BEARINGS, np.bool_)

@@ -9,7 +9,7 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import F64, Bools
-from datagen.workers.geometry.planar import crosses_itself, inside_polygon
+from datagen.workers.geometry.planar import crosses_itself, distance_to_border, inside_polygon
 from datagen.workers.robots import ROBOTS, robot_limits
 
 _SMALLEST_M, _LARGEST_M = 0.02, 2.0  # limits of a base, from the mount's axis
@@ -54,6 +54,11 @@ class Footprint:
     def width_m(self) -> float:
         """Half of its smaller extent along its axes: the room to pass straight ahead or across."""
         return self.radius_m if not self.corners_m else float(np.ptp(self.polygon_m, axis=0).min() / 2)
+
+    @property
+    def inner_radius_m(self) -> float:
+        """Radius of the largest circle around the arm's mount that it holds."""
+        return distance_to_border(self.polygon_m) if self.corners_m else self.radius_m
 
     def holds(self, points_m: F64) -> Bools:
         """Mask (N,) of points (N, 2), in the base's frame, that lie in it."""

@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from datagen.schemas.specification import ObservationParams
 from datagen.train.inputs import F32, F64, U8, Bools
 from datagen.train.prediction.frames import SensorFrame, moved
+from datagen.train.prediction.ground import distances_m
 from datagen.workers.rendering.cloud import Cloud, stored_cloud
 
 VOXEL_M = 0.005
@@ -76,10 +77,10 @@ def crop_cloud(seen: SeenPoints, center_m: F64, params: ObservationParams, rng: 
     Within the crop radius, up to `min_target_points` of the target first, then all in random order
     without repetition; the first stored ones are a farthest-point sample.
     """
-    rel = seen.points_m.astype(np.float64) - center_m
-    near = np.flatnonzero(np.einsum("ij,ij->i", rel, rel) <= params.crop_radius_m**2)
+    near = np.flatnonzero(distances_m(seen.points_m, center_m) <= params.crop_radius_m)
     sure = rng.permutation(near[seen.on_target[near]])[: params.min_target_points]
     fresh = np.ones(len(seen.points_m), np.bool_)
     fresh[sure] = False
     rows = np.concatenate([sure, (order := rng.permutation(near))[fresh[order]]])[: params.n_points]
-    return stored_cloud(rel[rows].astype(np.float32), seen.rgb[rows], seen.on_target[rows], params)
+    rel_m = (seen.points_m[rows].astype(np.float64) - center_m).astype(np.float32)
+    return stored_cloud(rel_m, seen.rgb[rows], seen.on_target[rows], params)

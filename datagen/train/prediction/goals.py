@@ -42,18 +42,16 @@ def write_goal(file: Path, p: Prediction, frame_id: str, stamp_ns: int) -> bool:
     if any(frame.T_world_camera is None for frame in p.frames):
         fix = "Give the frame's pose in the robot's map: pose.json, T_world_camera or --bag"
         raise InputError("--goal", "", "needs frames with poses", fix)
-    if p.best is None:
+    goal = goal_document(p, frame_id, stamp_ns)
+    if goal is None:
         for each in goal_files(file):
             each.unlink(missing_ok=True)
         return False
-    stamp = {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}
-    header: dict[str, Any] = {"frame_id": frame_id, "stamp": stamp}
-    base, T_mount_base = _base(p)
     match file.suffix:
         case ".yaml":
-            _write_text(file, _document(p, header, base, T_mount_base))
+            _write_text(file, goal)
         case ".mcap":
-            _write_messages(file, p, header, stamp_ns, T_mount_base)
+            _write_messages(file, p, goal, stamp_ns)
         case _:
             _write_map(file, p)
     return True
@@ -93,13 +91,18 @@ def _pose(p: Prediction, row: int, T_mount_base: F64) -> dict[str, dict[str, flo
     }
 
 
-def _document(p: Prediction, header: dict[str, Any], base: str, T_mount_base: F64) -> dict[str, Any]:
+def goal_document(p: Prediction, frame_id: str, stamp_ns: int) -> dict[str, Any] | None:
+    """What a goal's `.yaml` holds; None without a best pose or poses of the frames."""
+    if p.best is None or any(frame.T_world_camera is None for frame in p.frames):
+        return None
+    base, T_mount_base = _base(p)
+
     def scored(row: int) -> dict[str, Any]:
         codes = [code for code, _ in p.doubts_about(row)]
         level = {"score": float(p.score[row]), "level": "doubtful" if codes else "good", "reasons": codes}
         return {"pose": _pose(p, row, T_mount_base)} | level
 
-    assert p.best is not None
+    header = {"frame_id": frame_id, "stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}}
     best, others = scored(p.best), [scored(row) for row in alternatives(p)]
     goal = {"goal": {"header": header, "pose": best.pop("pose")}, "child_frame_id": base}
     return {**goal, **best, "may_miss_m": p.choice.miss_m, "alternatives": others}
@@ -131,23 +134,20 @@ def _write_map(file: Path, p: Prediction) -> None:
     _write_text(file.with_suffix(".yaml"), {"image": file.name, "mode": "raw", **numbers, **thresholds})
 
 
-def _write_messages(
-    file: Path, p: Prediction, header: dict[str, Any], stamp_ns: int, T_mount_base: F64
-) -> None:
+def _write_messages(file: Path, p: Prediction, goal: dict[str, Any], stamp_ns: int) -> None:
     # Imported here: of the extra `ros`.
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     from datagen.train.prediction.bags import STORE
 
-    assert p.best is not None
-    grid, cell_m, (x, y) = _costs(p)
-    poses = [_pose(p, row, T_mount_base) for row in [p.best, *alternatives(p)]]
+    (grid, cell_m, (x, y)), header = _costs(p), goal["goal"]["header"]
+    others = [each["pose"] for each in goal["alternatives"]]
     corner = {"position": {"x": x, "y": y, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
     size = {"resolution": cell_m, "width": grid.shape[1], "height": grid.shape[0], "origin": corner}
     info = {"map_load_time": header["stamp"], **size}
     messages = {
-        "/goal": ("geometry_msgs/msg/PoseStamped", {"header": header, "pose": poses[0]}),
-        "/alternatives": ("geometry_msgs/msg/PoseArray", {"header": header, "poses": poses[1:]}),
+        "/goal": ("geometry_msgs/msg/PoseStamped", goal["goal"]),
+        "/alternatives": ("geometry_msgs/msg/PoseArray", {"header": header, "poses": others}),
         "/scores": ("nav_msgs/msg/OccupancyGrid", {"header": header, "info": info, "data": grid.ravel()}),
     }
     with tempfile.TemporaryDirectory() as folder:

@@ -93,8 +93,8 @@ def find_ground(frame: SensorFrame, camera_height_m: float | None, gravity: F64 
             raise InputError("--gravity", "", "points up, by the level surfaces in the image", fix)
         return _with_residual(frame, level_pose(-down, camera_height_m), "gravity and the camera's height")
     floor = _floor_plane(frame, camera_height_m)
-    height_m, given = floor.height_m, f"{camera_height_m:.3f} m given"
-    how = f"the floor's plane in the depth, {height_m:.3f} m below the camera ({given})"
+    height_m, mean = floor.height_m, f"the mean of what was measured and the {camera_height_m:.3f} m given"
+    how = f"the floor's plane in the depth, {height_m:.3f} m below the camera: {mean}"
     return replace(_with_residual(frame, level_pose(floor.up, height_m), how), doubt=floor.doubt)
 
 
@@ -142,7 +142,7 @@ def _refuse_pose(frame: SensorFrame, T: F64) -> None:
         "Give T_world_camera of the camera's optical axes (x right, y down, z forward), in a world with z up "
         "and the floor at z = 0"
     )
-    z = moved(frame.points_m, T)[:, 2]
+    z = frame.points_m @ T[2, :3].astype(np.float32) + T[2, 3]
     under = float((z < -0.1 - 4 * depth_error_m(frame.points_m[:, 2])).mean())
     problem = ""
     if T[2, 2] > _STEEPLY_UP:
@@ -263,7 +263,7 @@ def _floor_towards(
         return InputError(place, "floor", problem, f"Correct --camera-height, or: {_FIX}")
     doubts = [f"it has only {share:.1%} of the points"] if share < _SURE_SHARE else []
     if abs(below_m[k] - camera_height_m) > _SURE_OFF_M:
-        doubts.append(f"it is {below_m[k]:.3f} m below the camera, {camera_height_m:.3f} m given")
+        doubts.append(f"{below_m[k]:.3f} m below the camera were measured, {camera_height_m:.3f} m given")
     return _Floor(up, height_m, share, ", and ".join(doubts) or None)
 
 

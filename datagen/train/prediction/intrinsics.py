@@ -49,7 +49,9 @@ class Pinhole:
     def points(self, u: I64, v: I64, depth_m: F32) -> F32:
         """Points (N, 3) in the camera's frame, of pixels (N,) with their depths (N,)."""
         x, y = (u - self.cx_px) / self.fx_px, (v - self.cy_px) / self.fy_px
-        return (np.stack([x, y, np.ones(len(u))], axis=1) * depth_m[:, None]).astype(np.float32)
+        found = np.empty((len(u), 3), np.float32)
+        found[:, 0], found[:, 1], found[:, 2] = x * depth_m, y * depth_m, depth_m
+        return found
 
     def pixels(self, points_m: F64) -> F64:
         """Pixels (N, 2), u and v, of points (N, 3) in the camera's frame."""

@@ -13,11 +13,12 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
-from datagen.train.inputs import F64
+from datagen.train.inputs import F64, Array
 from datagen.train.prediction.files import parse_yaml, read_grey
 from datagen.workers.json_document import JsonNode
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1  # as in nav_msgs/OccupancyGrid
+_OCCUPIED_PERCENT, _FREE_PERCENT = 65, 25
 _MOST_BYTES = 2**20
 _FIX = "Give a map.yaml of Nav2's map_saver: image, resolution, origin, negate, occupied_thresh, free_thresh"
 # The grey that map_saver writes for unknown cells. Nav2's own default, free_thresh 0.25, reads it as free
@@ -68,6 +69,16 @@ class KnownFloor:
         for each in self.keep_out:
             state[each.states(xy) == OCCUPIED] = OCCUPIED
         return xy[state == FREE], xy[state == OCCUPIED]
+
+
+def grid_map(
+    place: str, percent: Array, resolution_m: float, origin: tuple[float, float, float]
+) -> OccupancyMap:
+    """The map of an OccupancyGrid's values (H, W): percent of being occupied, -1 unknown."""
+    cells = np.full((percent.shape[0], percent.shape[1]), UNKNOWN, np.int8)
+    cells[percent >= _OCCUPIED_PERCENT] = OCCUPIED
+    cells[(percent >= 0) & (percent <= _FREE_PERCENT)] = FREE
+    return OccupancyMap(place, cells, resolution_m, origin)
 
 
 def read_map(path: Path) -> OccupancyMap:

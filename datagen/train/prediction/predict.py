@@ -17,7 +17,6 @@ from datagen.train.headings import refuse_other_heading, trained_side_deg
 from datagen.train.inputs import F64, Array, Batch, CandidateInputs, Clouds, RobotInputs
 from datagen.train.prediction.answer import CROP, Prediction
 from datagen.train.prediction.base_cells import (
-    BLOCKED,
     CLEAR,
     STATES,
     UNSEEN,
@@ -185,8 +184,8 @@ def _fill(frames: Sequence[SensorFrame]) -> tuple[list[SensorFrame], Filled | No
 
 
 def _locate(seen: SeenPoints) -> TargetBox:
-    points = seen.points_m.astype(np.float64)
-    return locate(points[seen.on_target], points[~seen.on_target], seen.eyes_m[0])
+    target = seen.points_m[seen.on_target].astype(np.float64)
+    return locate(target, seen.points_m[~seen.on_target], seen.eyes_m[0])
 
 
 def _grid(cells: int, half_width_m: float) -> CandidateParams:
@@ -200,7 +199,7 @@ def _grid(cells: int, half_width_m: float) -> CandidateParams:
 
 
 def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, cells: BaseCells) -> Batch[Array]:
-    """The base poses as input of a scorer; `base_is_clear` is false where a base pose is blocked."""
+    """The base poses as input of a scorer; `base_is_clear` is false where it cannot stand or get to."""
     n = len(cells.offset_m)
 
     def one(value: float) -> Array:
@@ -227,7 +226,7 @@ def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, cells: BaseCells) 
         ),
         np.zeros(n, np.int64),
         np.zeros((n, 16), np.uint8),
-        {"base_is_clear": cells.state != STATES.index(BLOCKED)},
+        {"base_is_clear": np.isin(cells.state, (STATES.index(CLEAR), STATES.index(UNSEEN)))},
     )
 
 

@@ -23,7 +23,7 @@ from datagen.train.prediction.bags import DAMAGED, FIX, OTHER_FRAME, Bag, stamp_
 from datagen.train.prediction.files import MAX_PIXELS, MAX_SIDE_PX, checked_pose, decoded, valid_depth
 from datagen.train.prediction.frames import RgbdImage, SensorFrame, image_frame, moved
 from datagen.train.prediction.intrinsics import Intrinsics, Pinhole
-from datagen.train.prediction.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyMap
+from datagen.train.prediction.occupancy import OccupancyMap, grid_map
 from datagen.train.prediction.transform_tree import NoTransformError, TransformTree
 from datagen.workers.geometry.transforms import inverse, pose
 
@@ -39,7 +39,6 @@ _COLOURS: dict[str, tuple[str, int, Any]] = {
 _DEPTHS = {"16UC1": ("u2", 1, 0), "mono16": ("u2", 1, 0), "32FC1": ("f4", 1, 0)}
 _APART_NS = 50 * 10**6  # of colour and depth
 _TRIES = 30  # images around the one that is asked for, of which the first with a pose is taken
-_OCCUPIED_PERCENT, _FREE_PERCENT = 65, 25
 _LEVEL = 0.9999  # cosine of a map's tilt
 
 
@@ -280,8 +279,5 @@ def _map(bag: Bag, topics: Mapping[str, str], world: str, recorded_ns: int) -> O
     if R[2, 2] < _LEVEL or np.abs(values[:2]).max() > 1e5:
         raise bag.error(topic, "has an origin that is tilted or no pose", "Give a level map, or --map")
     percent = np.asarray(grid.data, np.int8).reshape(info.height, info.width)
-    cells = np.full(percent.shape, UNKNOWN, np.int8)
-    cells[percent >= _OCCUPIED_PERCENT] = OCCUPIED
-    cells[(percent >= 0) & (percent <= _FREE_PERCENT)] = FREE
     origin = (float(values[0]), float(values[1]), math.atan2(R[1, 0], R[0, 0]))
-    return OccupancyMap(f"{bag.path}: {topic}", cells, float(info.resolution), origin)
+    return grid_map(f"{bag.path}: {topic}", percent, float(info.resolution), origin)

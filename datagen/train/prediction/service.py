@@ -3,76 +3,81 @@
 from __future__ import annotations
 
 import hmac
+import re
 import tempfile
-import threading
 from collections import OrderedDict
 from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from fastapi import Depends, FastAPI, HTTPException, Query, Request
-from starlette.concurrency import run_in_threadpool
 
 from datagen import __version__
 from datagen.schemas.errors import InputError
 from datagen.train.prediction.answer import Prediction
+from datagen.train.prediction.files import read_arrays
 from datagen.train.prediction.frames import SensorFrame, read_place
+from datagen.train.prediction.goals import goal_document
+from datagen.train.prediction.occupancy import OccupancyMap, grid_map
 from datagen.train.prediction.prediction_report import document
+from datagen.worker_processes import WorkerProcesses
 
 MOST_BYTES, MOST_SESSIONS, MOST_FRAMES = 64 << 20, 8, 6
+_BODY = "body.npz"
 
 Ask = Callable[[list[SensorFrame], dict[str, Any]], Prediction]  # of frames and options of a request
 
 
-class Sessions:
+class Sessions(OrderedDict[str, list[bytes]]):
     """Frames of the latest sessions. The oldest frames and the longest unused sessions go first."""
 
-    def __init__(self) -> None:
-        self._frames = OrderedDict[str, list[SensorFrame]]()
-        self._lock = threading.Lock()
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def joined(self, name: str, frame: SensorFrame) -> list[SensorFrame]:
-        """The session's frames with a new one."""
-        with self._lock:
-            frames = [*self._frames.pop(name, []), frame][-MOST_FRAMES:]
-            self._frames[name] = frames
-            while len(self._frames) > MOST_SESSIONS:
-                self._frames.popitem(last=False)
-            return frames
-
-    def forget(self, name: str) -> bool:
-        """Remove a session; whether it was there."""
-        with self._lock:
-            return self._frames.pop(name, None) is not None
+    def add(self, name: str, frame: bytes) -> None:
+        """Keep a new frame of a session."""
+        self[name] = [*self.pop(name, []), frame][-MOST_FRAMES:]
+        while len(self) > MOST_SESSIONS:
+            self.popitem(last=False)
 
 
-def make_app(ask: Ask, model: str, token: str | None) -> FastAPI:
-    """The application. Answers are computed one at a time; with a token, requests must give it."""
-    sessions, one_at_a_time = Sessions(), threading.Lock()
+@lru_cache(maxsize=MOST_FRAMES)
+def _read(body: bytes) -> tuple[SensorFrame, list[OccupancyMap]]:
+    """The frame of a body, and the map that it has."""
+    with tempfile.TemporaryDirectory() as folder:
+        (file := Path(folder) / _BODY).write_bytes(body)
+        frame, arrays = read_place(file), read_arrays(file, ("intrinsics", "map", "map_pose"))
+        if "map" not in arrays:
+            return frame, []
+        grid, at = arrays["map"], arrays.get("map_pose", np.zeros(0))
+        sound = grid.dtype == np.int8 and grid.ndim == 2 and at.shape == (4,)
+        if not (sound and (np.abs(at[:3]) < 1e5).all() and 0.001 <= at[3] <= 1):
+            fix = "Give map (H, W) as int8, as in OccupancyGrid, and map_pose: x, y, yaw and resolution"
+            raise InputError(file, "map", "is no map", fix)
+        x, y, yaw, resolution_m = at.tolist()
+        return frame, [grid_map("map", grid, resolution_m, (x, y, yaw))]
+
+
+def answer_of(ask: Ask, bodies: list[bytes], options: dict[str, Any]) -> dict[str, Any]:
+    """The document of an answer; `goal` has poses of the robot's base where the frames have poses."""
+    frames, maps = zip(*map(_read, bodies), strict=True)
+    found = ask(list(frames), options | {"map": maps[-1]})
+    return document(found) | {"goal": goal_document(found, "map", 0)}
+
+
+def make_app(workers: WorkerProcesses, model: str, token: str | None) -> FastAPI:
+    """The application, for workers that call `answer_of`; with a token, requests must give it."""
+    sessions = Sessions()
 
     def allowed(request: Request) -> None:
         given = request.headers.get("authorization", "")
         if token is not None and not hmac.compare_digest(given.encode(), f"Bearer {token}".encode()):
             raise HTTPException(401, "give the token: Authorization: Bearer WORD")
 
-    def answer(data: bytes, session: str | None, options: dict[str, Any]) -> dict[str, Any]:
-        with tempfile.NamedTemporaryFile(suffix=".npz") as file:
-            file.write(data)
-            file.flush()
-            try:
-                frame = read_place(file.name)
-                frames = [frame] if session is None else sessions.joined(session, frame)
-                with one_at_a_time:
-                    return document(ask(frames, options))
-            except InputError as error:
-                raise HTTPException(422, str(error).replace(file.name, "the body")) from None
-
-    app = FastAPI(title="datagen", version=__version__, dependencies=[Depends(allowed)])
+    rules = [Depends(allowed)]
+    app = FastAPI(title="datagen", version=__version__, dependencies=rules, lifespan=lambda _: workers)
 
     @app.get("/health")
-    def health() -> dict[str, Any]:  # pyright: ignore[reportUnusedFunction]
+    async def health() -> dict[str, Any]:  # pyright: ignore[reportUnusedFunction]
         """Which model answers, and how many sessions there are."""
         return {"model": model, "sessions": len(sessions)}
 
@@ -97,13 +102,20 @@ def make_app(ask: Ask, model: str, token: str | None) -> FastAPI:
             "arrival": arrival,
             "allow_unseen": allow_unseen,
             "camera_height": camera_height,
+            "candidates": candidates,
         }
-        found = await run_in_threadpool(answer, bytes(data), session, options)
+        frames = [*sessions.get(session or "", ()), bytes(data)][-MOST_FRAMES:]
+        try:
+            found = await workers.call(frames, options)
+        except InputError as error:
+            raise HTTPException(422, re.sub(rf"\S*/{_BODY}", "the body", str(error))) from None
+        if session is not None:  # not before: a frame that cannot be read would spoil the session
+            sessions.add(session, frames[-1])
         return found if candidates else {key: found[key] for key in found if key != "candidates"}
 
     @app.delete("/sessions/{name}")
-    def forget(name: str) -> dict[str, bool]:  # pyright: ignore[reportUnusedFunction]
+    async def forget(name: str) -> dict[str, bool]:  # pyright: ignore[reportUnusedFunction]
         """Forget the frames of a session."""
-        return {"was_there": sessions.forget(name)}
+        return {"was_there": sessions.pop(name, None) is not None}
 
     return app

@@ -49,7 +49,9 @@ def fill_target(frame: SensorFrame) -> tuple[SensorFrame, Filled]:
         raise InputError(frame.place, "target", problem, fix)
     if have == wanted:
         return frame, Filled(wanted, 0)
-    depth_m = from_nearest(image.depth_m, known)
+    (top, *_, bottom), (left, *_, right) = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
+    box, depth_m = np.s_[top : bottom + 1, left : right + 1], np.zeros_like(image.depth_m)
+    depth_m[box] = from_nearest(image.depth_m[box], known[box])
     pixels = np.flatnonzero((mask & ~known).ravel())
     return replace(
         frame,
@@ -66,7 +68,7 @@ def from_nearest(values: F32, known: Bools) -> F32:
     return values[rows, columns]
 
 
-def locate(target_m: F64, others_m: F64, eye_m: F64) -> TargetBox:
+def locate(target_m: F64, others_m: F32 | F64, eye_m: F64) -> TargetBox:
     """The box of the target from its visible points (N, 3), the others (M, 3) and the camera (3,), world.
 
     Across the line of sight it spans the visible points; along it their depth, at least the smaller of
@@ -111,10 +113,11 @@ def _least_width_m(xy_m: F64, centre_xy_m: F64) -> float:
     return float(2 * np.percentile(np.abs(along), 100 - _RIM_PERCENT, axis=0).min())
 
 
-def _support_under(others_m: F64, middle_xy: F64, half_m: float, low_m: float) -> float:
+def _support_under(others_m: F32 | F64, middle_xy: F64, half_m: float, low_m: float) -> float:
     """Height of the target's support: where most points around its foot lie, or its lowest point."""
-    near = (np.abs(others_m[:, :2] - middle_xy) < half_m).all(axis=1)
-    z = others_m[near & (others_m[:, 2] < low_m + 0.03) & (others_m[:, 2] > low_m - 0.1), 2]
+    x, y = (np.abs(others_m[:, k] - middle_xy[k]) < half_m for k in range(2))
+    z = others_m[x & y, 2].astype(np.float64)
+    z = z[(z < low_m + 0.03) & (z > low_m - 0.1)]
     if len(z) < 50:
         return float(low_m)
     counted, edges = np.histogram(z, np.arange(low_m - 0.1, low_m + 0.035, 0.005))

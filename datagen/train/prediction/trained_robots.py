@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from datagen.train.dataset import ROBOT_SIZES
 from datagen.train.prediction.base_cells import RobotSize
 from datagen.train.program_scorer import ProgramScorer
 from datagen.train.scorers import ModelScorer, Scorer
@@ -18,6 +17,8 @@ _SLACK_M = 0.01
 
 def trained_robots(head: CheckpointHead) -> dict[str, tuple[float, float]]:
     """The least and the largest of `ROBOT_SIZES` in the training data; empty for older checkpoints."""
+    from datagen.train.dataset import ROBOT_SIZES  # imports the store, which prediction does not need
+
     known = [origin["robots"] for origin in head.data if "robots" in origin]
     return {
         name: (min(sizes[name][0] for sizes in known), max(sizes[name][1] for sizes in known))

@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from datagen.schemas.fields import facing_rad
 from datagen.schemas.specification import CandidateParams, Range
-from datagen.schemas.stored_arrays import facing_rad
 from datagen.workers.bases.clearance import (
     Footprint,
     ObstacleDistances,

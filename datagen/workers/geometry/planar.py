@@ -128,6 +128,12 @@ def _corners_to_sides(corners_m: F64, polygons_m: F64) -> F64:
     return np.sqrt(((rel - t[..., None] * along) ** 2).sum(3).min((1, 2)))
 
 
+def distance_to_border(polygon_m: F64) -> float:
+    """Distance of the origin from the border of a polygon (K, 2)."""
+    sides = np.stack([polygon_m, following(polygon_m)], axis=1)
+    return float(signed_distances_to_convex(np.zeros((1, 2)), sides).min())  # a side has no inside
+
+
 def inside_polygon(points_m: F64, polygon_m: F64) -> npt.NDArray[np.bool_]:
     """Whether points (N, 2) lie in a simple polygon (K, 2), by the even-odd rule."""
     x, y = points_m[:, None, 0], points_m[:, None, 1]

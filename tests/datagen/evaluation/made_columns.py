@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from datagen.evaluation.columns import Columns
-from datagen.schemas.stored_arrays import facing_rad
+from datagen.schemas.fields import facing_rad
 
 
 def make_columns(

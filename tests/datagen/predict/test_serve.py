@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from fastapi.testclient import TestClient
 
@@ -82,6 +83,42 @@ def test_hostile_requests_get_a_reason(
 ) -> None:
     said = client.post("/base", content=packed(seen) if body is None else body, params=params)
     assert said.status_code == status and words in said.text and "/tmp" not in said.text
+
+
+def test_a_frame_that_cannot_be_read_does_not_spoil_its_session(client: TestClient, seen: Seen) -> None:
+    for body, params in ((b"PK", {}), (packed(seen, mask=None), {"click": "1,1"})):
+        assert client.post("/base", content=body, params={"session": "hall"} | params).status_code == 422
+    said = client.post("/base", content=packed(seen), params={"session": "hall"})
+    assert said.status_code == 200 and len(said.json()["T_world_camera"]) == 1
+
+
+def test_a_body_may_have_the_map_and_the_answer_has_goals(client: TestClient, seen: Seen) -> None:
+    low = camera_arrays(seen)[3][:2, 3] - 6.0
+    grid, at = np.zeros((240, 240), np.int8), np.array([*low, 0.0, 0.05])
+    assert client.post("/base", content=packed(seen)).json()["goal"] is None  # no floor is seen
+    goal = client.post("/base", content=packed(seen, map=grid, map_pose=at)).json()["goal"]
+    assert goal["child_frame_id"] == "base_link" and 0.5 < goal["score"] <= 1
+    for changed in (
+        {"map": grid},
+        {"map": grid * 1.0, "map_pose": at},
+        {"map": grid, "map_pose": at * np.nan},
+    ):
+        said = client.post("/base", content=packed(seen, **changed))
+        assert said.status_code == 422 and "the body: map: is no map" in said.text
+
+
+def test_the_service_goes_on_after_a_worker_was_killed(seen: Seen) -> None:
+    before = set(psutil.Process().children(recursive=True))
+    with TestClient(app_of(ServeOptions(**SIZES)), raise_server_exceptions=False) as client:
+        assert client.post("/base", content=packed(seen)).status_code == 200
+        workers = [each for each in psutil.Process().children() if each not in before]
+        for each in workers:
+            if "spawn_main" in " ".join(each.cmdline()):
+                each.kill()
+        statuses = [client.post("/base", content=packed(seen)).status_code for _ in range(2)]
+        assert statuses[-1] == 200
+    left = set(psutil.Process().children(recursive=True)) - before
+    assert not any("spawn_main" in " ".join(each.cmdline()) for each in left if each.is_running())
 
 
 def test_a_large_body_is_refused(client: TestClient, seen: Seen, monkeypatch: pytest.MonkeyPatch) -> None:

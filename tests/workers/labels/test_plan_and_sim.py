@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import OUTCOMES, RETRY_OUTCOMES, SCHEMAS
+from datagen.schemas.fields import OUTCOMES, RETRY_OUTCOMES, SCHEMAS, facing_rad
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import (
@@ -23,7 +23,6 @@ from datagen.schemas.specification import (
     TrialParams,
     VisibilityParams,
 )
-from datagen.schemas.stored_arrays import facing_rad
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.transforms import pose, translation
