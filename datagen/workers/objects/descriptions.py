@@ -27,7 +27,7 @@ _SOLIDS = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "ellipsoid": 3}
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A mesh, or a solid about the origin: full sides of a box or an ellipsoid, radius (and length along z)."""
+    """A mesh, or a solid about the origin: sides of a box or an ellipsoid, radius (and length)."""
 
     T: F64  # (4, 4), to the object's frame
     mesh: Path | None
@@ -134,7 +134,7 @@ class _Mjcf:
         for element in self.root.iter("compiler"):
             self.compiler |= element.attrib
         for element in self.root.iterfind("default"):
-            self._default(element, "", {})
+            self._default(element, "", self.defaults[""])
         for element in self.root.iterfind("asset/*"):
             name = element.get("name") or Path(element.get("file", "")).stem
             self.assets[element.tag, name] = element
@@ -155,44 +155,33 @@ class _Mjcf:
             raise _wrong(self.path, "include", "holds more than 100,000 elements")
         return root
 
-    def _default(self, element: Element, above: str, inherited: dict[str, Mapping[str, str]]) -> None:
-        name = element.get("class", "" if not above else above)
+    def _default(self, element: Element, name: str, inherited: dict[str, Mapping[str, str]]) -> None:
         own = {**inherited}
         for each in element:
             if each.tag != "default":
                 own[each.tag] = {**own.get(each.tag, {}), **each.attrib}
-        self.defaults[name if inherited or element.get("class") not in (None, "main") else ""] = own
+        self.defaults[name] = own
         for each in element.iterfind("default"):
-            self._default(each, name, own)
+            self._default(each, each.get("class", ""), own)
 
     def attributes(self, element: Element, kind: str) -> dict[str, str]:
         """An element's attributes over those of its default class."""
-        own = self.defaults.get(element.get("class", kind), self.defaults[""]).get(element.tag, {})
-        return {**own, **element.attrib}
+        own = self.defaults.get(element.get("class", kind), self.defaults[""])
+        return {**own.get(element.tag, {}), **element.attrib}
 
     def numbers(self, given: Mapping[str, str], key: str, count: int, default: str) -> F64:
         return _numbers(self.path, f"{given.get('name', 'geom')} {key}", given.get(key, default), count)
 
     def pose(self, given: Mapping[str, str]) -> F64:
+        if unread := given.keys() & {"zaxis", "xyaxes", "axisangle", "fromto"}:
+            raise _wrong(self.path, given.get("name", ""), f"uses {min(unread)}, which is not read")
         T, turn = np.eye(4), 1.0 if self.compiler.get("angle") == "radian" else math.pi / 180
         T[:3, 3] = self.numbers(given, "pos", 3, "0 0 0")
         if "quat" in given:
-            R = Rotation.from_quat(self.numbers(given, "quat", 4, ""), scalar_first=True)
+            T[:3, :3] = Rotation.from_quat(self.numbers(given, "quat", 4, ""), scalar_first=True).as_matrix()
         elif "euler" in given:
-            R = Rotation.from_euler(
-                self.compiler.get("eulerseq", "XYZ"), self.numbers(given, "euler", 3, "") * turn
-            )
-        elif "axisangle" in given:
-            axis = self.numbers(given, "axisangle", 4, "")
-            R = Rotation.from_rotvec(axis[:3] / np.linalg.norm(axis[:3]) * axis[3] * turn)
-        elif "zaxis" in given:
-            R = Rotation.align_vectors(self.numbers(given, "zaxis", 3, "")[None], np.array([[0.0, 0, 1]]))[0]
-        elif "xyaxes" in given:
-            x, y = self.numbers(given, "xyaxes", 6, "").reshape(2, 3)
-            R = Rotation.from_matrix(np.stack([x, y, np.cross(x, y)], axis=1))
-        else:
-            return T
-        T[:3, :3] = R.as_matrix()
+            angles, axes = self.numbers(given, "euler", 3, "") * turn, self.compiler.get("eulerseq", "xyz")
+            T[:3, :3] = Rotation.from_euler(axes.swapcase(), angles).as_matrix()
         return T
 
     def geoms(self, body: Element, T: F64, kind: str, depth: int = 0) -> Iterator[tuple[dict[str, str], F64]]:
@@ -230,15 +219,9 @@ class _Mjcf:
             return Piece(T, self._file(mesh, "meshdir"), scale, "", one, rgb, image)
         if kind not in _SOLIDS:
             return None
-        half, more = _numbers(self.path, f"{kind} size", given.get("size", ""), 0), 0.0
-        if "fromto" in given:
-            a, b = self.numbers(given, "fromto", 6, "").reshape(2, 3)
-            more, T = float(np.linalg.norm(b - a)) / 2, T @ self.pose({"zaxis": " ".join(map(str, b - a))})
-            T[:3, 3] += (a + b) / 2
-            half = np.array([half[0], more] if kind in ("cylinder", "capsule") else [half[0], half[0], more])
+        half = self.numbers(given, "size", 0, "")[: _SOLIDS[kind]]
         if len(half) < _SOLIDS[kind]:
             raise _wrong(self.path, f"{kind} size", "has too few numbers")
-        half = half[: _SOLIDS[kind]]
         whole = np.array([half[0], 2 * half[1]]) if len(half) == 2 else half if len(half) == 1 else 2 * half
         return Piece(T, None, one, kind, whole, rgb, image)
 
@@ -257,7 +240,7 @@ def _mjcf(path: Path) -> Description:
     for body in model.root.iterfind("worldbody"):
         for given, T in itertools.islice(model.geoms(body, np.eye(4), ""), _MOST_PIECES + 1):
             piece = model.piece(given, T)
-            if piece is None or given.get("rgba", "1 1 1 1").split()[3:] == ["0"] and "mesh" not in given:
+            if piece is None or (given.get("rgba", "1 1 1 1").split()[3:] == ["0"] and "mesh" not in given):
                 continue
             collides = given.get("contype", "1") != "0" or given.get("conaffinity", "1") != "0"
             seen.append((piece, collides, float(model.numbers(given, "group", 1, "0")[0]) >= _HIDDEN_GROUP))
@@ -283,7 +266,7 @@ def _numbers(path: Path, where: str, text: str, count: int) -> F64:
         values = np.array([float(word) for word in text.split()])
     except ValueError:
         values = np.full(max(1, count), np.nan)
-    if count and len(values) != count or not (np.abs(values) <= MOST).all():
+    if (count and len(values) != count) or not (np.abs(values) <= MOST).all():
         raise _wrong(path, where[:80], f"{text!r:.80} is not {count or 'a few'} finite numbers")
     return values
 

@@ -27,7 +27,8 @@ from datagen.workers.objects.ycb_layouts import INDEXES
 from datagen.workers.source_statement import read_statement
 
 # Part of every digest: raise it when the same files are read differently.
-VERSION = 1
+VERSION = 2
+ALL = "*"  # the name of the row that holds for all objects
 _LISTS = CacheFolder("folders", most_files=64)
 
 
@@ -51,7 +52,7 @@ class FolderObjects:
         self._root, self.statement = folder, read_statement(folder)
         files, tree = find_objects(folder)
         self._files = {entry.name: entry for entry in files}
-        self._table = _read_table(folder / TABLE, set(self._files))
+        self._table = _read_table(folder / TABLE, {*self._files, ALL})
         key = f"{tree}-{VERSION}"
         stored = _LISTS.load(key)
         if stored is None:
@@ -83,11 +84,14 @@ class FolderObjects:
             found = self._found[name]
             stored = CACHE.load(f"{found.digest}-folder")
             if stored is None:
-                scan = read_object(self._files[name], self._root, self._table.get(name, {})).scan
+                scan = read_object(self._files[name], self._root, self._given(name)).scan
             else:
                 scan = restored_scan(stored)
             self._models[name] = model_of(name, found.digest, found.mass_kg, scan)
         return self._models[name]
+
+    def _given(self, name: str) -> Given:
+        return {**self._table.get(ALL, {}), **self._table.get(name, {})}
 
     def _examined(self, entry: ObjectFiles) -> Found:
         try:
@@ -95,7 +99,7 @@ class FolderObjects:
                 raise InputError(
                     entry.path, "", "the name has unprintable or too many characters", "Rename it"
                 )
-            read = read_object(entry, self._root, self._table.get(entry.name, {}))
+            read = read_object(entry, self._root, self._given(entry.name))
         except InputError as error:
             where = os.path.relpath(error.place, self._root) if os.path.isabs(error.place) else error.place
             return Found("", 0.0, {}, f"{error.problem} ({where}{error.field and ': '}{error.field})")

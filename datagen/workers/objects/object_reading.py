@@ -13,7 +13,6 @@ import trimesh
 from scipy.spatial import QhullError
 
 from datagen.schemas.errors import InputError
-from datagen.workers.geometry.mesh import F32
 from datagen.workers.objects.convex import MAX_PARTS, ConvexParts, components, convex_parts, not_convex
 from datagen.workers.objects.decomposition import closed_volume_m3, decompose, error_text
 from datagen.workers.objects.descriptions import Description, Piece, read_description
@@ -22,7 +21,7 @@ from datagen.workers.objects.exclusions import (
     MIN_DENSITY_KG_M3,
     reason_to_exclude,
 )
-from datagen.workers.objects.hulls import few_vertices, hull_of
+from datagen.workers.objects.hulls import Hull, few_vertices, hull_of
 from datagen.workers.objects.object_files import DESCRIPTIONS, TABLE, ObjectFiles
 from datagen.workers.objects.scan import MAX_SIZE_M, Scan
 from datagen.workers.objects.standing import rotation_of, unit_m, upright
@@ -33,6 +32,8 @@ Given = dict[str, Any]  # what a row of the table states of an object
 
 MIN_SIZE_M = 0.005
 _MOST_CORNERS = 64
+_FILLED = 0.95
+_LARGE_M, _MOST_KG = 0.6, 50.0
 # Half of the YCB objects have less than 466 kg per m3 of their convex parts.
 DEFAULT_DENSITY_KG_M3 = 500.0
 # By a word in the names of its materials; of household things, whose parts fill what is hollow.
@@ -96,12 +97,14 @@ def read_object(entry: ObjectFiles, root: Path, given: Given) -> ReadObject:
     points = visual.vertices[np.unique(visual.faces)]
     low, high = points.min(axis=0), points.max(axis=0)
     T[:3, :3], T[:3, 3] = np.eye(3), -(low + high) / 2
+    if (high - low).max() > _LARGE_M:
+        notes["large"] = f"{(high - low).max():.2f} m"
     if np.abs(T[:3, 3]).max() > 2 * (high - low).max():
         notes["far from its origin"] = f"{np.abs(T[:3, 3]).max():.2f} m"
     visual, bodies = visual.moved(T), [body.moved(T) for body in bodies]
     volume_m3 = closed_volume_m3(visual)
     if volume_m3 == 0:
-        notes["not watertight"] = "its surface has holes, or edges of more than two faces"
+        notes["not watertight"] = ""
     parts = _parts(str(entry.path), visual.turned() if volume_m3 < 0 else visual, bodies, notes)
     mass_kg = _mass_kg(entry.name, given, described, reader, parts, notes)
     x, y, z = map(float, high - low)
@@ -170,7 +173,7 @@ def _parts(place: str, visual: Surface, bodies: list[Surface], notes: dict[str, 
         if gap > 0.01 + 0.05 * size.max():
             notes["collision mesh not used"] = f"its bounding box is {gap:.3g} m off"
             found, bodies = None, []
-    elif closed_volume_m3(visual) > 0.98 * hull.volume_m3:
+    elif _is_convex(visual, hull):
         found = [hull.vertices_m]
     if found is None:
         surface = joined(bodies) if bodies else visual
@@ -181,6 +184,13 @@ def _parts(place: str, visual: Surface, bodies: list[Surface], notes: dict[str, 
     if not parts.vertices_m:
         raise InputError(place, "", "has no convex part with volume", "Give a solid body")
     return parts
+
+
+def _is_convex(surface: Surface, hull: Hull) -> bool:
+    """Whether a surface, perhaps with small holes, fills its hull: a cup of one sheet has no lid."""
+    cones = surface.vertices[surface.faces] - hull.vertices_m.mean(axis=0)
+    share = abs(np.linalg.det(cones).sum()) / 6 / hull.volume_m3
+    return share > _FILLED and not not_convex(surface.vertices, surface.faces)
 
 
 def _given_parts(bodies: list[Surface]) -> list[Any] | None:
@@ -227,6 +237,9 @@ def _mass_kg(
             density, why = DEFAULT_DENSITY_KG_M3, "assumed"
         mass_kg = density * volume_m3
         notes["mass by density"] = f"{density:g} kg/m3 {why}"
-    if reason := reason_to_exclude(name, mass_kg, volume_m3, measured):
+    reason = reason_to_exclude(name, mass_kg, volume_m3, measured)
+    if mass_kg > _MOST_KG:
+        reason = f"wrong mass: {mass_kg:.3g} kg"
+    if reason:
         raise InputError(name, "", reason, f"State its mass in {TABLE}")
     return mass_kg

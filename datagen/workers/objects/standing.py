@@ -12,6 +12,7 @@ from datagen.workers.objects.scan import MAX_SIZE_M, STANDS_M
 _IN_MILLIMETRES = 20.0
 # An object stands where the centre is this share of its height within the edge of what it stands on.
 _MARGIN = 0.08
+_LIKELY = 0.7  # of the best chance: of a pan's two sides, the one below
 _NEAR = np.cos(np.radians(10.0))
 _UPS = {"z": (0, 0, 1), "-z": (0, 0, -1), "y": (0, 1, 0), "-y": (0, -1, 0), "x": (1, 0, 0), "-x": (-1, 0, 0)}
 
@@ -30,8 +31,8 @@ def rotation_of(up: str) -> F64:
 def upright(points_m: F64) -> tuple[F64, str]:
     """The rotation (3, 3) that puts points (N, 3) upright, and what was done, "" for nothing.
 
-    z stays up where the hull of the points stands so. Else y is up, where it rests on y = 0 or stands so, else
-    the direction of the most probable rest: the facets below the centre, by their solid angle.
+    z stays up where the hull stands so. Else y is up, where the points rest on y = 0 or stand so, else
+    the direction of the most probable rests that is nearest to z: facets below the centre, by solid angle.
     """
     hull = ConvexHull(points_m)
     corners = points_m[hull.simplices]
@@ -43,7 +44,7 @@ def upright(points_m: F64) -> tuple[F64, str]:
     on_y = high[1] - low[1] > STANDS_M[1] and abs(low[1]) < STANDS_M[0] and low[2] < -STANDS_M[1]
     for up in ("y", "z") if on_y else ("z", "y"):
         if _stands(points_m @ rotation_of(up).T, rotation_of(up) @ centre):
-            return rotation_of(up), "" if up == "z" else "turned upright: y was up"
+            return rotation_of(up), "" if up == "z" else "y was up"
     down = hull.equations[:, :3]
     a, b, c = (corners[:, k] - centre for k in range(3))
     lengths = [np.linalg.norm(x, axis=1) for x in (a, b, c)]
@@ -58,8 +59,10 @@ def upright(points_m: F64) -> tuple[F64, str]:
     ]
     if not below:
         return np.eye(3), "stands on no side: z is kept up"
-    chance = [round(float(angle[down @ down[k] > _NEAR].sum()), 3) for k in below]
-    return _turning(-down[below[int(np.argmax(chance))]]), "turned upright: laid on its most probable side"
+    chances = np.array([angle[down @ down[k] > _NEAR].sum() for k in below])
+    likely = [k for k, chance in zip(below, chances, strict=True) if chance > _LIKELY * chances.max()]
+    down_m = min((tuple(np.round(down[k], 6)) for k in likely), key=lambda n: (n[2], n))
+    return _turning(-np.array(down_m) / np.linalg.norm(down_m)), "laid on its side"
 
 
 def _stands(points_m: F64, centre: F64) -> bool:

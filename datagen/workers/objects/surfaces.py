@@ -246,7 +246,8 @@ def _msh(path: Path) -> Surface:
     if uvs != vertices or not faces or corners.min() < 0 or corners.max() >= vertices:
         return surface
     start = 3 * vertices + 3 * normals
-    return replace(surface, uv=values[start : start + 2 * uvs].reshape(-1, 2)[corners])
+    uv = values[start : start + 2 * uvs].reshape(-1, 2) * (1, -1) + (0, 1)  # from the upper left corner
+    return replace(surface, uv=uv[corners])
 
 
 def _checked(path: Path, surface: Surface) -> Surface:
