@@ -74,7 +74,9 @@ def own_files(folder: Path) -> None:
 def link_libraries(site: Path, *extras: str) -> None:
     """Link what the wheel asks for with these extras, and what that asks for in turn."""
     libraries = Path(sysconfig.get_path("purelib"))
-    assert set(extras) <= set(metadata(DISTRIBUTION).get_all("Provides-Extra", [])), f"no such extra: {extras}"
+    assert set(extras) <= set(metadata(DISTRIBUTION).get_all("Provides-Extra", [])), (
+        f"no such extra: {extras}"
+    )
     names = list(_closure(DISTRIBUTION, extras, {}))
     if {"all", "sim"} & set(extras) and "mani-skill" not in names:
         names.append("mani-skill")  # where pip cannot, users install it by a command of its own

@@ -52,7 +52,7 @@ def check_source(given: str, shown: Progress) -> Checked:
     if kind not in HOUSE_SOURCES and kind not in OBJECT_SOURCES:
         kind = _kind_of(Path(given).expanduser())
         ref = f"{kind}:{given}"
-    shown.phase("reading it; objects without collision meshes take up to a minute each, once")
+    shown.phase("opening houses and objects")
     houses = open_houses(ref if kind in HOUSE_SOURCES else "builtin")
     objects = open_objects(ref if kind in OBJECT_SOURCES else "builtin")
     surveys = survey_sources(houses, objects, shown.counter("houses examined"))

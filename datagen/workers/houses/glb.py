@@ -51,8 +51,8 @@ def read_glb(path: Path) -> Mesh:
 def read_pieces(path: Path, kind: str, resolver: Any = None) -> list[Any]:
     """The meshes of trimesh that a file of a kind ("glb", "ply", ..) holds, each placed as in its scene.
 
-    From memory: only what `resolver` gives is read of other files. Raises InputError as `read_glb` does, or one
-    of `DAMAGE`.
+    From memory: of other files only what `resolver` gives is read. Raises InputError as `read_glb` does, or
+    one of `DAMAGE`.
     """
     # Imported here: only AI2-THOR houses, robots and some objects need it.
     import trimesh
@@ -61,9 +61,8 @@ def read_pieces(path: Path, kind: str, resolver: Any = None) -> list[Any]:
     if kind == "glb":
         refuse_other_kind(path, data, "a binary glTF file", _FIX)
         _check_header(path, data)
-    scene = cast(
-        Any, trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, skip_materials=False)
-    )
+    options: dict[str, Any] = {"skip_materials": False} if kind == "glb" else {"process": False}
+    scene = cast(Any, trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, **options))
     placed = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
     # Counted before meshes are copied for each instance.
     count = sum(len(m.faces) for m in placed if isinstance(m, trimesh.Trimesh))

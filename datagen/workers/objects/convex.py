@@ -137,6 +137,7 @@ def _read_ply(path: Path) -> tuple[F64, list[npt.NDArray[np.int64]]]:
 
 
 def components(faces: npt.NDArray[np.int64], n_vertices: int) -> list[npt.NDArray[np.int64]]:
+    """The faces (F, 3) of each piece that shares no vertex with others."""
     of_face = vertex_components(faces, n_vertices)[faces[:, 0]]
     order = np.argsort(of_face, kind="stable")
     cuts = np.flatnonzero(np.diff(of_face[order])) + 1

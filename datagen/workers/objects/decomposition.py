@@ -47,6 +47,9 @@ def decompose(surface: Surface, place: str) -> tuple[F32, ...]:
     """
     points, at = np.unique(np.round(surface.vertices, 6), axis=0, return_inverse=True)
     faces = at.reshape(-1)[surface.faces].astype(np.int32)
+    # In one order, whatever the file's: each from its lowest corner on, sorted.
+    first = faces.argmin(axis=1)[:, None]
+    faces = np.unique(np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1), axis=0)
     key = hashlib.sha256(json.dumps([_SETTINGS, versions_of(["coacd"])]).encode())
     key.update(points.tobytes() + faces.tobytes())
     stored = _CACHE.load(key.hexdigest())

@@ -56,6 +56,9 @@ def read_description(path: Path) -> Description:
         raise _wrong(path, "", "holds no shape of an object")
     if max(len(found.visuals), len(found.collisions)) > _MOST_PIECES:
         raise _wrong(path, "", f"has more than {_MOST_PIECES:,} shapes")
+    for piece in (*found.visuals, *found.collisions):
+        if piece.solid and not (piece.size_m > 0).all():
+            raise _wrong(path, piece.solid, "has no volume")
     return found
 
 

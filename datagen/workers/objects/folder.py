@@ -101,7 +101,7 @@ class FolderObjects:
                 )
             read = read_object(entry, self._root, self._given(entry.name))
         except InputError as error:
-            where = os.path.relpath(error.place, self._root) if os.path.isabs(error.place) else error.place
+            where = os.path.relpath(error.place, self._root)
             return Found("", 0.0, {}, f"{error.problem} ({where}{error.field and ': '}{error.field})")
         content = hashlib.sha256()
         arrays = stored_scan(read.scan)

@@ -39,7 +39,7 @@ class Material:
 
 
 def read_materials(library: Path) -> dict[str, Material]:
-    """The materials of a library by name. Raises InputError naming the library, and the line of a bad image."""
+    """The materials of a library by name. Raises InputError naming the library and the line."""
     data = read_regular(library, _MAX_BYTES, "Put the mesh's material library next to it")
     refuse_other_kind(library, data, "text", _BAKE)
     found: dict[str, Material] = {}

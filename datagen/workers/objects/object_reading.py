@@ -106,7 +106,7 @@ def read_object(entry: ObjectFiles, root: Path, given: Given) -> ReadObject:
     if volume_m3 == 0:
         notes["not watertight"] = ""
     parts = _parts(str(entry.path), visual.turned() if volume_m3 < 0 else visual, bodies, notes)
-    mass_kg = _mass_kg(entry.name, given, described, reader, parts, notes)
+    mass_kg = _mass_kg(entry, given, described, reader, parts, notes)
     x, y, z = map(float, high - low)
     mesh = mesh_of(visual.turned() if volume_m3 < 0 else visual)
     return ReadObject(Scan(mesh, parts, (x, y, z)), mass_kg, notes | reader.said)
@@ -121,8 +121,6 @@ def _surface(reader: SurfaceReader, piece: Piece) -> Surface:
         image = None if piece.image is None else reader.image(piece.image, piece.image.name)
         return reader.read(piece.mesh).painted(piece.rgb, image).moved(piece.T, piece.scale)
     size, make = piece.size_m, trimesh.creation
-    if not (size > 0).all():
-        raise InputError(reader.root, piece.solid, "has no volume", "Correct its size")
     if piece.solid == "box":
         solid = make.box(size)
     elif piece.solid == "cylinder":
@@ -208,7 +206,7 @@ def _given_parts(bodies: list[Surface]) -> list[Any] | None:
 
 
 def _mass_kg(
-    name: str,
+    entry: ObjectFiles,
     given: Given,
     described: Description,
     reader: SurfaceReader,
@@ -218,7 +216,7 @@ def _mass_kg(
     """Of the table, the YCB's data sheet or the file, else by a density, which is noted."""
     volume_m3 = parts.volume_m3
     density, why = float(given.get("density_kg_m3", 0)), "of the table"
-    mass_kg = float(given.get("mass_kg", 0)) or (0 if density else PUBLISHED_MASS_KG.get(name, 0))
+    mass_kg = float(given.get("mass_kg", 0)) or (0 if density else PUBLISHED_MASS_KG.get(entry.name, 0))
     if not mass_kg and not density and described.mass_kg:
         if MIN_DENSITY_KG_M3 <= described.mass_kg / volume_m3 <= MAX_DENSITY_KG_M3:
             mass_kg = described.mass_kg
@@ -237,9 +235,9 @@ def _mass_kg(
             density, why = DEFAULT_DENSITY_KG_M3, "assumed"
         mass_kg = density * volume_m3
         notes["mass by density"] = f"{density:g} kg/m3 {why}"
-    reason = reason_to_exclude(name, mass_kg, volume_m3, measured)
+    reason = reason_to_exclude(entry.name, mass_kg, volume_m3, measured)
     if mass_kg > _MOST_KG:
         reason = f"wrong mass: {mass_kg:.3g} kg"
     if reason:
-        raise InputError(name, "", reason, f"State its mass in {TABLE}")
+        raise InputError(entry.path, "", reason, f"State its mass in {TABLE}")
     return mass_kg

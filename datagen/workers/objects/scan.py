@@ -25,7 +25,7 @@ READER_VERSION = 1
 # Part of every cache key: raise it also when files are refused that were read before.
 _CACHE_VERSION = 2
 # A mesh stands where its lowest point is within the first of 0, and does not beyond the second.
-STANDS_M = (0.01, 0.015)
+_STANDS_M = (0.01, 0.015)
 MIN_SIZE_M = 0.002
 MAX_SIZE_M = 2.0
 CACHE = CacheFolder("objects", most_files=4096)
@@ -110,7 +110,7 @@ def read_scan(visual: Path, texture: Path, collision: Path) -> Scan:
             f"the mesh spans {size.max():.4g} m, where {MIN_SIZE_M} to {MAX_SIZE_M} m are expected",
             "Scale the mesh to metres",
         )
-    if size[1] > STANDS_M[1] and abs(low[1]) < STANDS_M[0] and low[2] < -STANDS_M[1]:
+    if size[1] > _STANDS_M[1] and abs(low[1]) < _STANDS_M[0] and low[2] < -_STANDS_M[1]:
         problem = f"y is up: the mesh stands on y = {low[1]:.3f} and reaches down to z = {low[2]:.3f} m"
         raise InputError(visual, "v", problem, "Export both meshes with z up")
     centre = (low + high) / 2

@@ -6,12 +6,14 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.objects.scan import MAX_SIZE_M, STANDS_M
+from datagen.workers.objects.scan import MAX_SIZE_M
 
 # A mesh longer than this is not in metres; up to a tenth of it, it could be in centimetres or inches.
 _IN_MILLIMETRES = 20.0
 # An object stands where the centre is this share of its height within the edge of what it stands on.
 _MARGIN = 0.08
+# y is up where the mesh rests on y = 0, and more than this share of it is below z = 0.
+_AT_ZERO, _SUNK = 0.02, 0.2
 _LIKELY = 0.7  # of the best chance: of a pan's two sides, the one below
 _NEAR = np.cos(np.radians(10.0))
 _UPS = {"z": (0, 0, 1), "-z": (0, 0, -1), "y": (0, 1, 0), "-y": (0, -1, 0), "x": (1, 0, 0), "-x": (-1, 0, 0)}
@@ -41,7 +43,7 @@ def upright(points_m: F64) -> tuple[F64, str]:
     volumes = np.abs(np.linalg.det(corners - inner))
     centre = np.average(corners.mean(axis=1) * 0.75 + inner * 0.25, axis=0, weights=volumes)
     low, high = points_m.min(axis=0), points_m.max(axis=0)
-    on_y = high[1] - low[1] > STANDS_M[1] and abs(low[1]) < STANDS_M[0] and low[2] < -STANDS_M[1]
+    on_y = abs(low[1]) < _AT_ZERO * (high - low).max() and low[2] < -_SUNK * (high[2] - low[2])
     for up in ("y", "z") if on_y else ("z", "y"):
         if _stands(points_m @ rotation_of(up).T, rotation_of(up) @ centre):
             return rotation_of(up), "" if up == "z" else "y was up"

@@ -112,12 +112,12 @@ class SurfaceReader:
                 return path
         except (OSError, ValueError, RuntimeError):  # a NUL, a name too long, a loop of links
             pass
-        raise InputError(repr(str(path))[:300], "", f"is not inside {self.root}", "Copy it there")
+        raise InputError(path, "", "is not inside the folder of the objects", "Copy it there")
 
     def read(self, path: Path) -> Surface:
         """The surface in the file's unit, glTF and COLLADA turned to z up, COLLADA in metres.
 
-        Raises InputError naming the file: missing, damaged, outside the folder, without faces, beyond the limits.
+        Raises InputError naming the file: missing, damaged, outside the folder, without faces, too large.
         """
         kind = self.inside(path).suffix.lower()
         try:
@@ -228,7 +228,7 @@ def _frame(path: Path, kind: str) -> tuple[F64, float]:
         return (_Y_UP if kind == ".glb" else np.eye(4)), 1.0
     from collada import Collada
 
-    about = Collada(str(path), ignore=[Exception]).assetInfo
+    about: Any = Collada(str(path), ignore=[Exception]).assetInfo
     return (np.eye(4) if about.upaxis == "Z_UP" else _Y_UP), float(about.unitmeter or 1.0)
 
 
@@ -265,7 +265,7 @@ def _checked(path: Path, surface: Surface) -> Surface:
 
 
 def mesh_of(surface: Surface) -> Mesh:
-    """The mesh in metres: one texture, an atlas where the surface has several images, none where it has none."""
+    """The mesh in metres: one texture, an atlas of several images, or none."""
     uv, images, image = surface.uv, list(surface.images), surface.image
     if not (image >= 0).any():
         used, faces = np.unique(surface.faces, return_inverse=True)
