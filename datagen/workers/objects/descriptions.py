@@ -176,12 +176,16 @@ class _Mjcf:
         return _numbers(self.path, f"{given.get('name', 'geom')} {key}", given.get(key, default), count)
 
     def pose(self, given: Mapping[str, str]) -> F64:
-        if unread := given.keys() & {"zaxis", "xyaxes", "axisangle", "fromto"}:
+        if unread := given.keys() & {"zaxis", "xyaxes", "fromto"}:
             raise _wrong(self.path, given.get("name", ""), f"uses {min(unread)}, which is not read")
         T, turn = np.eye(4), 1.0 if self.compiler.get("angle") == "radian" else math.pi / 180
         T[:3, 3] = self.numbers(given, "pos", 3, "0 0 0")
         if "quat" in given:
             T[:3, :3] = Rotation.from_quat(self.numbers(given, "quat", 4, ""), scalar_first=True).as_matrix()
+        elif "axisangle" in given:
+            *axis, angle = self.numbers(given, "axisangle", 4, "")
+            rotation = Rotation.from_rotvec(np.array(axis) / np.linalg.norm(axis) * angle * turn)
+            T[:3, :3] = rotation.as_matrix()
         elif "euler" in given:
             angles, axes = self.numbers(given, "euler", 3, "") * turn, self.compiler.get("eulerseq", "xyz")
             T[:3, :3] = Rotation.from_euler(axes.swapcase(), angles).as_matrix()

@@ -173,14 +173,15 @@ def _parts(place: str, visual: Surface, bodies: list[Surface], notes: dict[str, 
             found, bodies = None, []
     elif _is_convex(visual, hull):
         found = [hull.vertices_m]
+    is_given = found is not None
     if found is None:
-        surface = joined(bodies) if bodies else visual
-        found = list(decompose(surface, place))
-        notes["decomposed"] = error_text(visual, tuple(found))
+        found = list(decompose(joined(bodies) if bodies else visual, place))
     few = [few_vertices(hull_of(p).vertices_m, _MOST_CORNERS) for p in convex_parts(found).vertices_m]
     parts = convex_parts(few)
     if not parts.vertices_m:
         raise InputError(place, "", "has no convex part with volume", "Give a solid body")
+    if not is_given:
+        notes["decomposed"] = error_text(visual, parts.vertices_m)
     return parts
 
 
