@@ -21,7 +21,7 @@ from datagen.workers.objects.surfaces import Surface
 
 # CoACD's defaults search ten times as long for parts that are no better.
 _SETTINGS = {
-    **{"threshold": 0.05, "resolution": 1000, "mcts_nodes": 10, "mcts_iterations": 20, "mcts_max_depth": 2},
+    **{"threshold": 0.08, "resolution": 1000, "mcts_nodes": 10, "mcts_iterations": 20, "mcts_max_depth": 2},
     **{"max_convex_hull": 64, "seed": 1},
 }
 _LONGEST_S = 600.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -19,9 +19,10 @@ from datagen.workers.robots.urdf import MOST, read_urdf, rpy_rotation
 from datagen.workers.xml_file import read_xml
 
 _FIX = "Correct the file, or remove it"
-_MOST_PIECES, _DEEPEST = 1000, 20
+_MOST_PIECES, _MOST_FILES, _DEEPEST = 1000, 100, 20
 # MuJoCo shows the groups below this one.
 _HIDDEN_GROUP = 3
+_SDF_SOLIDS = {"box": [("size", 3)], "sphere": [("radius", 1)], "cylinder": [("radius", 1), ("length", 1)]}
 _SOLIDS = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "ellipsoid": 3}
 
 
@@ -48,10 +49,13 @@ class Description:
     density_kg_m3: float | None = None
 
 
-def read_description(path: Path) -> Description:
-    """The object of a file. Raises InputError naming it: broken, with joints that move, without shapes."""
-    reader = {".urdf": _urdf, ".sdf": _sdf, ".xml": _mjcf}[path.suffix.lower()]
-    found = reader(path)
+def read_description(path: Path, inside: Callable[[Path], Path]) -> Description:
+    """The object of a file; `inside` returns the paths that it may include, and raises InputError for others.
+
+    Raises InputError naming the file: broken, with joints that move, without shapes.
+    """
+    kind = path.suffix.lower()
+    found = _urdf(path) if kind == ".urdf" else _sdf(path) if kind == ".sdf" else _mjcf(path, inside)
     if not found.visuals and not found.collisions:
         raise _wrong(path, "", "holds no shape of an object")
     if max(len(found.visuals), len(found.collisions)) > _MOST_PIECES:
@@ -98,19 +102,17 @@ def _sdf(path: Path) -> Description:
                 T, rgb = T_link @ _sdf_pose(path, shape), None
                 if shape.find("material/diffuse") is not None:
                     rgb = tuple(_text(path, shape, "material/diffuse", 4, "1 1 1 1")[:3])
-                map_ = shape.findtext("material/pbr/metal/albedo_map", "").strip()
-                image = _model_path(map_, path) if map_ else None
-                uri = shape.findtext("geometry/mesh/uri", "").strip()
+                uri, image = (
+                    _model_path(text.strip(), path) if (text := shape.findtext(tag, "")) else None
+                    for tag in ("geometry/mesh/uri", "material/pbr/metal/albedo_map")
+                )
                 scale = _text(path, shape, "geometry/mesh/scale", 3, "1 1 1")
-                if uri:
-                    pieces.append(Piece(T, _model_path(uri, path), scale, "", scale, rgb, image))
-                for solid, keys in (("box", "size"), ("sphere", "radius"), ("cylinder", "radius length")):
+                if uri is not None:
+                    pieces.append(Piece(T, uri, scale, "", scale, rgb, image))
+                for solid, keys in _SDF_SOLIDS.items():
                     if shape.find(f"geometry/{solid}") is not None:
-                        each = [
-                            _text(path, shape, f"geometry/{solid}/{k}", 3 if solid == "box" else 1, "")
-                            for k in keys.split()
-                        ]
-                        pieces.append(Piece(T, None, scale, solid, np.concatenate(each), rgb, image))
+                        sizes = [_text(path, shape, f"geometry/{solid}/{key}", n, "") for key, n in keys]
+                        pieces.append(Piece(T, None, scale, solid, np.concatenate(sizes), rgb, image))
     return Description(visuals, collisions, mass_kg or None)
 
 
@@ -128,9 +130,9 @@ def _model_path(uri: str, path: Path) -> Path:
 class _Mjcf:
     """One model with its includes: the compiler's settings, assets, and defaults by class."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.root = self._included(path, 0)
+    def __init__(self, path: Path, inside: Callable[[Path], Path]) -> None:
+        self.path, self.inside, self.files = path, inside, 0
+        self.root = self._included(path)
         self.compiler: dict[str, str] = {}
         self.defaults: dict[str, dict[str, Mapping[str, str]]] = {"": {}}
         self.assets: dict[tuple[str, str], Element] = {}
@@ -142,20 +144,18 @@ class _Mjcf:
             name = element.get("name") or Path(element.get("file", "")).stem
             self.assets[element.tag, name] = element
 
-    def _included(self, path: Path, depth: int) -> Element:
+    def _included(self, path: Path) -> Element:
         """The file's root; each <include> is replaced by what its file holds."""
-        if depth > _DEEPEST:
-            raise _wrong(self.path, "include", "includes itself")
-        root = read_xml(path, _FIX)
+        self.files += 1
+        if self.files > _MOST_FILES:
+            raise _wrong(self.path, "include", f"includes itself, or more than {_MOST_FILES} files")
+        root = read_xml(self.inside(path), _FIX)
         for parent in list(root.iter()):
             for at in range(len(parent) - 1, -1, -1):
                 if parent[at].tag == "include":
-                    name = parent[at].get("file", "")
-                    near = path.parent / name
-                    file = near if near.is_file() else self.path.parent / name
-                    parent[at : at + 1] = list(self._included(file, depth + 1))
-        if sum(1 for _ in root.iter()) > 100_000:
-            raise _wrong(self.path, "include", "holds more than 100,000 elements")
+                    near = path.parent / parent[at].get("file", "")
+                    file = near if near.is_file() else self.path.parent / parent[at].get("file", "")
+                    parent[at : at + 1] = list(self._included(file))
         return root
 
     def _default(self, element: Element, name: str, inherited: dict[str, Mapping[str, str]]) -> None:
@@ -237,8 +237,8 @@ class _Mjcf:
         return self.path.parent / at / asset.get("file", "").replace("\\", "/")
 
 
-def _mjcf(path: Path) -> Description:
-    model, mass_kg = _Mjcf(path), 0.0
+def _mjcf(path: Path, inside: Callable[[Path], Path]) -> Description:
+    model, mass_kg = _Mjcf(path, inside), 0.0
     inertials = [*model.root.iterfind("worldbody//inertial")]
     for each in inertials:
         mass_kg += float(model.numbers(each.attrib, "mass", 1, "0")[0])

@@ -85,7 +85,7 @@ def read_object(entry: ObjectFiles, root: Path, given: Given) -> ReadObject:
     """The object of files below `root`. Raises InputError naming the file that cannot be used."""
     reader = SurfaceReader(root)
     if entry.path.suffix.lower() in DESCRIPTIONS:
-        described = read_description(reader.inside(entry.path))
+        described = read_description(reader.inside(entry.path), reader.inside)
     else:
         collisions = [] if entry.collision is None else [_piece(entry.collision)]
         described = Description([_piece(entry.path)], collisions, None)

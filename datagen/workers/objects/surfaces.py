@@ -158,7 +158,7 @@ class SurfaceReader:
     def _obj(self, path: Path) -> Surface:
         mesh = read_obj(path)
         surface = plain_surface(mesh.vertices, mesh.faces, cuts=mesh.group_starts[mesh.group_starts > 0])
-        has_uv = (mesh.uv_faces >= 0).all(axis=1)
+        has_uv = np.all(mesh.uv_faces >= 0, axis=1)
         if has_uv.any():
             uv = np.where(has_uv[:, None, None], mesh.uv[np.maximum(mesh.uv_faces, 0)], 0.0)
             surface = replace(surface, uv=uv)

@@ -77,6 +77,8 @@ BAD: dict[str, tuple[str, str | bytes, str]] = {
     "mjcf of negative size": ("a.xml", MJCF.format("", '<geom type="box" size="0.1 -1 0.1"/>'), "no volume"),
     "mjcf that is not read": ("a.xml", MJCF.format("", '<geom size="0.03" zaxis="1 0 0"/>'), "zaxis"),
     "mjcf includes itself": ("a.xml", MJCF.format('<include file="a.xml"/>', BALL), "includes itself"),
+    "mjcf includes outside": ("a.xml", MJCF.format('<include file="../../b.xml"/>', BALL), "not inside"),
+    "mjcf includes itself twice": ("a.xml", MJCF.format(2 * '<include file="a.xml"/>', BALL), "100 files"),
     "mjcf includes nothing": ("a.xml", MJCF.format('<include file="b.xml"/>', BALL), "b.xml"),
 }  # fmt: skip
 
@@ -86,6 +88,7 @@ def test_a_bad_file_is_skipped_with_its_reason(case: str, tmp_path: Path) -> Non
     name, content, named = BAD[case]
     (tmp_path / "bad").mkdir()
     (tmp_path / "bad" / name).write_bytes(content.encode() if isinstance(content, str) else content)
+    (tmp_path.parent / "b.xml").write_text(MJCF.format("", BALL))
     (tmp_path / "bad/a.msh").write_bytes(struct.pack("<4i", 8, 0, 0, 10**9) + bytes(96))
     write_as("stl", box(0.04, 0.05, 0.06), tmp_path / "good")
     source = open_objects(f"folder:{tmp_path}")
