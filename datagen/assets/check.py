@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -14,53 +13,42 @@ from datagen.workers.objects import OBJECT_SOURCES, ObjectSource, open_objects
 from datagen.workers.source_statement import STATEMENT
 from datagen.workers.survey import Survey, survey_sources
 
-_LICENCES = ("licen", "copying")
+_LICENCES = ("licen", "copying", STATEMENT)
 _MOST_LICENCES = 20
 
 
-@dataclass(frozen=True)
-class Checked:
-    """A source that was opened; `objects` is None for houses."""
+def check_source(given: str, shown: Progress) -> tuple[str, Survey, list[str], ObjectSource | None]:
+    """Open and examine `KIND:DIR`, or DIR, whose kind follows from its content. Raises InputError.
 
-    ref: str
-    survey: Survey
-    licences: list[str]
-    objects: ObjectSource | None
-
-    def rows(self) -> list[dict[str, Any]]:
-        """Name, size, mass and remarks of each usable object."""
-        if self.objects is None:
-            return []
-        notes: Mapping[str, Mapping[str, str]] = getattr(self.objects, "notes", {})
-        models = [self.objects.load(name) for name in self.objects.names()]
-        return [
-            {
-                "name": m.name,
-                "size_m": list(m.size_m),
-                "mass_kg": m.mass_kg,
-                "parts": len(m.convex_parts_m),
-                "can_be_target": m.can_be_target,
-                "notes": dict(notes.get(m.name, {})),
-            }
-            for m in models
-        ]
-
-
-def check_source(given: str, shown: Progress) -> Checked:
-    """Open and examine `KIND:DIR`, or DIR, whose kind follows from its content. Raises InputError."""
-    ref, kind = given, given.partition(":")[0]
-    if kind not in HOUSE_SOURCES and kind not in OBJECT_SOURCES:
-        kind = _kind_of(Path(given).expanduser())
-        ref = f"{kind}:{given}"
-    shown.phase("opening houses and objects")
-    houses = open_houses(ref if kind in HOUSE_SOURCES else "builtin")
-    objects = open_objects(ref if kind in OBJECT_SOURCES else "builtin")
-    surveys = survey_sources(houses, objects, shown.counter("houses examined"))
-    survey = surveys.get("houses" if kind in HOUSE_SOURCES else "objects")
-    if survey is None:
+    Returns the reference, what was read, files that state licences, and the source; None for houses.
+    """
+    kind, _, text = given.partition(":")
+    if kind not in HOUSE_SOURCES | OBJECT_SOURCES:
+        text = given
+        kind = _kind_of(Path(text).expanduser())
+    ref, of_houses = f"{kind}:{text}", kind in HOUSE_SOURCES
+    if not text:
         raise InputError(given, "", "has no files to check", "Name a folder of houses or objects")
-    folder = Path(ref.partition(":")[2]).expanduser()
-    return Checked(ref, survey, _licences(folder), objects if kind in OBJECT_SOURCES else None)
+    shown.phase("opening houses and objects")
+    houses, objects = (
+        open_houses(ref if of_houses else "builtin"),
+        open_objects("builtin" if of_houses else ref),
+    )
+    surveys = survey_sources(houses, objects, shown.counter("houses examined"))
+    folder = Path(text).expanduser()
+    found = (str(p.relative_to(folder)) for p in folder.rglob("*") if p.name.lower().startswith(_LICENCES))
+    licences = sorted(islice(found, _MOST_LICENCES))
+    return ref, surveys["houses" if of_houses else "objects"], licences, None if of_houses else objects
+
+
+def object_rows(source: ObjectSource) -> list[dict[str, Any]]:
+    """Name, size, mass, number of parts and remarks of each usable object."""
+    notes = getattr(source, "notes", {})
+    return [
+        {"name": m.name, "size_m": list(m.size_m), "mass_kg": m.mass_kg, "parts": len(m.convex_parts_m)}
+        | {"can_be_target": m.can_be_target, "notes": notes.get(m.name, {})}
+        for m in map(source.load, source.names())
+    ]
 
 
 def _kind_of(folder: Path) -> str:
@@ -69,15 +57,3 @@ def _kind_of(folder: Path) -> str:
     if any(path.name.endswith((".jsonl", ".jsonl.gz")) for path in folder.iterdir()):
         return "procthor"
     return "ai2thor" if (folder / "configs" / "scenes").is_dir() else "folder"
-
-
-def _licences(folder: Path) -> list[str]:
-    """Files that state a licence, by their paths below the folder."""
-    found = (
-        path
-        for path in folder.rglob("*")
-        if path.name.lower().startswith(_LICENCES) or path.name == STATEMENT
-    )
-    return sorted(
-        str(path.relative_to(folder)) for path, _ in zip(found, range(_MOST_LICENCES), strict=False)
-    )

@@ -8,7 +8,7 @@ from pathlib import Path
 from cyclopts import App
 
 from datagen.assets.catalogue import CATALOGUE, select
-from datagen.assets.check import check_source
+from datagen.assets.check import check_source, object_rows
 from datagen.assets.fetch import Fetched, fetch, refuse_full_disk
 from datagen.assets.object_split import split_objects
 from datagen.console.options import AsJson, refuse_output
@@ -59,31 +59,26 @@ def check(source: str, /, *, picture: Path | None = None, json: AsJson = False) 
     if picture is not None:
         refuse_output(picture, "--picture", ".png")
     with Progress(json) as shown:
-        checked = check_source(source, shown)
-    rows = checked.rows()
+        ref, survey, licences, objects = check_source(source, shown)
+    if picture is not None and objects is None:
+        raise InputError("--picture", str(picture), "is of objects, not of houses", "Omit it")
+    rows = [] if objects is None else object_rows(objects)
     if json:
-        print_json(
-            {"source": checked.ref, **asdict(checked.survey), "objects": rows, "licences": checked.licences}
-        )
+        print_json({"source": ref, **asdict(survey), "objects": rows, "licences": licences})
     else:
         table = [
             (
-                row["name"],
-                " x ".join(f"{100 * side:.1f}" for side in row["size_m"]),
-                f"{row['mass_kg']:.3f}",
-                str(row["parts"]),
-                "yes" if row["can_be_target"] else "",
+                *(row["name"], " x ".join(f"{100 * side:.1f}" for side in row["size_m"])),
+                *(f"{row['mass_kg']:.3f}", str(row["parts"]), "yes" if row["can_be_target"] else ""),
                 "; ".join(f"{cause}: {detail}".removesuffix(": ") for cause, detail in row["notes"].items()),
             )
             for row in rows
         ]
-        print_rows(checked.ref, table, ("object", "size in cm", "kg", "parts", "target", "remarks"))
-        print_lines("\n".join(checked.survey.lines(checked.ref, with_reasons=True)))
-        print_lines(f"licences: {', '.join(checked.licences) or 'none found'}")
-    if picture is not None:
-        if checked.objects is None:
-            raise InputError("--picture", str(picture), "is of objects, not of houses", "Omit it")
-        draw_objects(checked.objects, picture)
+        print_rows(ref, table, ("object", "size in cm", "kg", "parts", "target", "remarks"))
+        print_lines("\n".join(survey.lines(ref, with_reasons=True)))
+        print_lines(f"licences: {', '.join(licences) or 'none found'}")
+    if picture is not None and objects is not None:
+        draw_objects(objects, picture)
     return 0
 
 

@@ -25,6 +25,7 @@ _SETTINGS = {
     **{"max_convex_hull": 64, "seed": 1},
 }
 _LONGEST_S = 600.0
+LATE = "has no convex parts after"
 _PROGRAM = """
 import io, json, sys
 import coacd, numpy as np
@@ -71,7 +72,7 @@ def _run(given: dict[str, np.ndarray], place: str) -> dict[str, np.ndarray]:
         with np.load(io.BytesIO(done.stdout.partition(b"PARTS")[2])) as parts:
             return dict(parts)
     except subprocess.TimeoutExpired:
-        raise InputError(place, "", f"has no convex parts after {_LONGEST_S:.0f} s", fix) from None
+        raise InputError(place, "", f"{LATE} {_LONGEST_S:.0f} s", fix) from None
     except subprocess.CalledProcessError as error:
         if b"No module named 'coacd'" in error.stderr:
             problem = "needs coacd, as it has no collision mesh"

@@ -18,6 +18,8 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.content_cache import CacheFolder
+from datagen.workers.extras import versions_of
+from datagen.workers.objects.decomposition import LATE
 from datagen.workers.objects.model import ObjectModel, ObjectSource
 from datagen.workers.objects.object_files import TABLE, ObjectFiles, find_objects
 from datagen.workers.objects.object_reading import GIVEN, Given, read_object
@@ -30,6 +32,7 @@ from datagen.workers.source_statement import read_statement
 VERSION = 1
 ALL = "*"  # the name of the row that holds for all objects
 _LISTS = CacheFolder("folders", most_files=64)
+_LIBRARIES = ("coacd", "pycollada", "scipy", "trimesh")
 
 
 @dataclass(frozen=True)
@@ -53,13 +56,14 @@ class FolderObjects:
         files, tree = find_objects(folder)
         self._files = {entry.name: entry for entry in files}
         self._table = _read_table(folder / TABLE, {*self._files, ALL})
-        key = f"{tree}-{VERSION}"
+        key = digest_of([tree, VERSION, versions_of(_LIBRARIES)])
         stored = _LISTS.load(key)
         if stored is None:
             with ThreadPoolExecutor(os.cpu_count()) as pool:
                 found = dict(zip(self._files, pool.map(self._examined, files), strict=True))
-            listed = json.dumps({name: asdict(each) for name, each in found.items()})
-            _LISTS.store(key, {"list": np.array(listed)})
+            if not any(LATE in each.reason for each in found.values()):  # of a busy machine, perhaps
+                listed = json.dumps({name: asdict(each) for name, each in found.items()})
+                _LISTS.store(key, {"list": np.array(listed)})
         else:
             found = {name: Found(**each) for name, each in json.loads(str(stored["list"])).items()}
         self._found = {name: each for name, each in found.items() if not each.reason}
@@ -97,7 +101,7 @@ class FolderObjects:
         try:
             if not entry.name.isprintable() or len(entry.name) > 200:
                 raise InputError(
-                    entry.path, "", "the name has unprintable or too many characters", "Rename it"
+                    entry.path, "", "its name has unprintable or too many characters", "Rename it"
                 )
             read = read_object(entry, self._root, self._given(entry.name))
         except InputError as error:
@@ -106,9 +110,8 @@ class FolderObjects:
         content = hashlib.sha256()
         arrays = stored_scan(read.scan)
         for name in sorted(arrays):
-            content.update(
-                f"{name} {arrays[name].dtype} {arrays[name].shape}".encode() + arrays[name].tobytes()
-            )
+            content.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
+            content.update(arrays[name].tobytes())
         digest = digest_of([VERSION, content.hexdigest(), read.mass_kg.hex()])
         CACHE.store(f"{digest}-folder", arrays)
         return Found(digest, read.mass_kg, read.notes)
@@ -133,21 +136,15 @@ def _read_table(path: Path, names: set[str]) -> dict[str, Given]:
     text = read_regular(path, 1 << 24, fix).decode("utf-8-sig", "replace")
     rows: dict[str, Given] = {}
     for number, row in enumerate(csv.DictReader(io.StringIO(text)), 2):
-        name, given = row.get("name") or "", Given()
+        name, given, line = row.get("name") or "", Given(), f"line {number}"
         if name not in names or name in rows:
-            raise InputError(
-                path,
-                f"line {number}",
-                f"{name!r:.80} is {'twice here' if name in rows else 'no object'}",
-                fix,
-            )
+            problem = f"{name!r:.80} is {'twice here' if name in rows else 'no object'}"
+            raise InputError(path, line, problem, fix)
         for key, cell in row.items():
             if key != "name" and cell:
                 try:
                     given[key] = GIVEN[key](cell.strip())
                 except (KeyError, ValueError, AttributeError, TypeError):
-                    raise InputError(
-                        path, f"line {number}", f"{key} = {cell!r:.80} cannot be read", fix
-                    ) from None
+                    raise InputError(path, line, f"{key} = {cell!r:.80} cannot be read", fix) from None
         rows[name] = given
     return rows

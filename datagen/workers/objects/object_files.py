@@ -26,7 +26,6 @@ _INNER = ("google_16k", "google_64k", "google_512k", "poisson", "tsdf", "meshes"
 _COLLISION = re.compile(
     r"(?:^|[-_. ])(?:col|coll|collision|collider|convex|vhacd|coacd|hull|contact\d*)(?=$|[-_. ])", re.I
 )
-_NOT_OBJECTS = ("clouds", "collision", "materials", "textures", "thumbnails")
 
 
 @dataclass(frozen=True)
@@ -67,15 +66,12 @@ def _folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
     """Folders above their subfolders, each with the files that matter; links to folders are not followed."""
     count = 0
     for at, folders, files in os.walk(root):
-        folders[:] = sorted(
-            f for f in folders if not f.startswith((".", "__")) and f.lower() not in _NOT_OBJECTS[:1]
-        )
+        folders[:] = sorted(f for f in folders if not f.startswith((".", "__")) and f.lower() != "clouds")
         wanted = [Path(at, refuse_not_utf8(f)) for f in sorted(files) if f.lower().endswith(_HASHED)]
         count += len(wanted)
         if count > _MOST_FILES:
-            raise InputError(
-                root, "", f"holds more than {_MOST_FILES:,} files", "Give a folder of objects alone"
-            )
+            fix = "Give a folder of objects alone"
+            raise InputError(root, "", f"holds more than {_MOST_FILES:,} files", fix)
         yield Path(at), wanted
 
 

@@ -29,6 +29,7 @@ from datagen.workers.objects.surfaces import Surface, SurfaceReader, joined, mes
 from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG
 
 Given = dict[str, Any]  # what a row of the table states of an object
+Notes = dict[str, str]  # by cause
 
 MIN_SIZE_M = 0.005
 _MOST_CORNERS = 64
@@ -78,7 +79,7 @@ class ReadObject:
 
     scan: Scan
     mass_kg: float
-    notes: dict[str, str]
+    notes: Notes
 
 
 def read_object(entry: ObjectFiles, root: Path, given: Given) -> ReadObject:
@@ -91,7 +92,7 @@ def read_object(entry: ObjectFiles, root: Path, given: Given) -> ReadObject:
         described = Description([_piece(entry.path)], collisions, None)
     visual = joined([_surface(reader, piece) for piece in described.visuals or described.collisions])
     bodies = [_surface(reader, piece) for piece in described.collisions]
-    notes: dict[str, str] = {}
+    notes: Notes = {}
     T, scale = _frame(entry, visual, given, notes)
     visual, bodies = visual.moved(T, scale), [body.moved(T, scale) for body in bodies]
     points = visual.vertices[np.unique(visual.faces)]
@@ -106,7 +107,9 @@ def read_object(entry: ObjectFiles, root: Path, given: Given) -> ReadObject:
     if volume_m3 == 0:
         notes["not watertight"] = ""
     parts = _parts(str(entry.path), visual.turned() if volume_m3 < 0 else visual, bodies, notes)
-    mass_kg = _mass_kg(entry, given, described, reader, parts, notes)
+    mass_kg = _mass_kg(
+        entry, given, described, " ".join(sorted(reader.materials)).lower(), parts.volume_m3, notes
+    )
     x, y, z = map(float, high - low)
     mesh = mesh_of(visual.turned() if volume_m3 < 0 else visual)
     return ReadObject(Scan(mesh, parts, (x, y, z)), mass_kg, notes | reader.said)
@@ -133,7 +136,7 @@ def _surface(reader: SurfaceReader, piece: Piece) -> Surface:
     return plain_surface(solid.vertices, solid.faces).painted(piece.rgb).moved(piece.T)
 
 
-def _frame(entry: ObjectFiles, visual: Surface, given: Given, notes: dict[str, str]) -> tuple[Any, float]:
+def _frame(entry: ObjectFiles, visual: Surface, given: Given, notes: Notes) -> tuple[Any, float]:
     """The rotation (4, 4) that puts a surface upright, after its scale to metres."""
     points = visual.vertices[np.unique(visual.faces)]
     size = np.ptp(points, axis=0)
@@ -157,7 +160,7 @@ def _frame(entry: ObjectFiles, visual: Surface, given: Given, notes: dict[str, s
     return T, scale
 
 
-def _parts(place: str, visual: Surface, bodies: list[Surface], notes: dict[str, str]) -> ConvexParts:
+def _parts(place: str, visual: Surface, bodies: list[Surface], notes: Notes) -> ConvexParts:
     """Given convex parts, else those of a decomposition, each of few corners."""
     found: list[Any] | None = None
     hull = hull_of(visual.vertices[np.unique(visual.faces)])
@@ -165,9 +168,7 @@ def _parts(place: str, visual: Surface, bodies: list[Surface], notes: dict[str, 
         found = _given_parts(bodies)
         corners = np.concatenate(found or [visual.vertices])
         size = hull.high_m - hull.low_m
-        gap = max(
-            np.abs(corners.min(axis=0) - hull.low_m).max(), np.abs(corners.max(axis=0) - hull.high_m).max()
-        )
+        gap = np.abs([corners.min(axis=0) - hull.low_m, corners.max(axis=0) - hull.high_m]).max()
         if gap > 0.01 + 0.05 * size.max():
             notes["collision mesh not used"] = f"its bounding box is {gap:.3g} m off"
             found, bodies = None, []
@@ -207,15 +208,9 @@ def _given_parts(bodies: list[Surface]) -> list[Any] | None:
 
 
 def _mass_kg(
-    entry: ObjectFiles,
-    given: Given,
-    described: Description,
-    reader: SurfaceReader,
-    parts: ConvexParts,
-    notes: dict[str, str],
+    entry: ObjectFiles, given: Given, described: Description, materials: str, volume_m3: float, notes: Notes
 ) -> float:
     """Of the table, the YCB's data sheet or the file, else by a density, which is noted."""
-    volume_m3 = parts.volume_m3
     density, why = float(given.get("density_kg_m3", 0)), "of the table"
     mass_kg = float(given.get("mass_kg", 0)) or (0 if density else PUBLISHED_MASS_KG.get(entry.name, 0))
     if not mass_kg and not density and described.mass_kg:
@@ -228,9 +223,8 @@ def _mass_kg(
     if not measured:
         if not density and described.density_kg_m3:
             density, why = described.density_kg_m3, "of the file"
-        words = " ".join(sorted(reader.materials)).lower()
         for pattern, by_word in _DENSITIES_KG_M3.items():
-            if not density and (word := re.search(pattern, words)):
+            if not density and (word := re.search(pattern, materials)):
                 density, why = by_word, f"of {word[0]}"
         if not density:
             density, why = DEFAULT_DENSITY_KG_M3, "assumed"
