@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import QhullError
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
@@ -104,7 +105,9 @@ class FolderObjects:
                     entry.path, "", "its name has unprintable or too many characters", "Rename it"
                 )
             read = read_object(entry, self._root, self._given(entry.name))
-        except InputError as error:
+        except (QhullError, ValueError, LookupError, ArithmeticError, MemoryError) as error:
+            if not isinstance(error, InputError):  # numbers that no check foresaw
+                error = InputError(entry.path, "", f"cannot be read ({type(error).__name__})", "Repair it")
             where = os.path.relpath(error.place, self._root)
             return Found("", 0.0, {}, f"{error.problem} ({where}{error.field and ': '}{error.field})")
         content = hashlib.sha256()

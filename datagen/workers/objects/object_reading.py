@@ -13,6 +13,7 @@ import trimesh
 from scipy.spatial import QhullError
 
 from datagen.schemas.errors import InputError
+from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.objects.convex import MAX_PARTS, ConvexParts, components, convex_parts, not_convex
 from datagen.workers.objects.decomposition import closed_volume_m3, decompose, error_text
 from datagen.workers.objects.descriptions import Description, Piece, read_description
@@ -106,13 +107,12 @@ def read_object(entry: ObjectFiles, root: Path, given: Given) -> ReadObject:
     volume_m3 = closed_volume_m3(visual)
     if volume_m3 == 0:
         notes["not watertight"] = ""
-    parts = _parts(str(entry.path), visual.turned() if volume_m3 < 0 else visual, bodies, notes)
-    mass_kg = _mass_kg(
-        entry, given, described, " ".join(sorted(reader.materials)).lower(), parts.volume_m3, notes
-    )
+    visual = visual.turned() if volume_m3 < 0 else visual
+    parts = _parts(str(entry.path), visual, bodies, notes)
+    materials = " ".join(sorted(reader.materials)).lower()
+    mass_kg = _mass_kg(entry, given, described, materials, parts.volume_m3, notes)
     x, y, z = map(float, high - low)
-    mesh = mesh_of(visual.turned() if volume_m3 < 0 else visual)
-    return ReadObject(Scan(mesh, parts, (x, y, z)), mass_kg, notes | reader.said)
+    return ReadObject(Scan(mesh_of(visual), parts, (x, y, z)), mass_kg, notes | reader.said)
 
 
 def _piece(mesh: Path) -> Piece:
@@ -177,13 +177,20 @@ def _parts(place: str, visual: Surface, bodies: list[Surface], notes: Notes) -> 
     is_given = found is not None
     if found is None:
         found = list(decompose(joined(bodies) if bodies else visual, place))
-    few = [few_vertices(hull_of(p).vertices_m, _MOST_CORNERS) for p in convex_parts(found).vertices_m]
-    parts = convex_parts(few)
+    parts = convex_parts(map(_few_corners, convex_parts(found).vertices_m))
     if not parts.vertices_m:
         raise InputError(place, "", "has no convex part with volume", "Give a solid body")
     if not is_given:
         notes["decomposed"] = error_text(visual, parts.vertices_m)
     return parts
+
+
+def _few_corners(points_m: F32) -> F64:
+    corners_m = hull_of(points_m).vertices_m
+    try:
+        return few_vertices(corners_m, _MOST_CORNERS)
+    except QhullError:  # nearly flat
+        return corners_m
 
 
 def _is_convex(surface: Surface, hull: Hull) -> bool:
