@@ -227,3 +227,60 @@ def test_a_statement_is_kept(tmp_path: Path) -> None:
     write_as("stl", box(0.04, 0.05, 0.06), tmp_path / "a")
     (tmp_path / "source.json").write_text(json.dumps({"licence": "CC0-1.0"}))
     assert FolderObjects(tmp_path).statement == {"licence": "CC0-1.0"}
+
+
+def test_what_does_not_stand_is_laid_on_its_most_probable_side(tmp_path: Path) -> None:
+    write_as("stl", box(0.2, 0.003, 0.2), tmp_path / "plate on edge")
+    write_as("stl", box(0.004, 0.15, 0.004).apply_translation((0, 0.2, 1)), tmp_path / "lying pen")
+    pan = trimesh.util.concatenate(
+        [box(0.2, 0.2, 0.04), box(0.3, 0.02, 0.01).apply_translation((0.3, 0, 0.03))]
+    )
+    # Tilted, it stands neither on z nor on y; its bottom is nearer to z than its rim.
+    tilted = trimesh.transformations.rotation_matrix(0.3, (0.8, 0.6, 0))
+    write_as("stl", pan.apply_transform(tilted), tmp_path / "tilted pan")
+    write_as("stl", trimesh.creation.icosphere(radius=0.03), tmp_path / "ball")
+    source = FolderObjects(tmp_path)
+    assert source.load("plate on edge").size_m[2] == pytest.approx(0.003, abs=1e-5)
+    assert source.load("lying pen").size_m[2] == pytest.approx(0.004, abs=1e-5)
+    assert source.load("tilted pan").size_m[2] == pytest.approx(0.04, abs=1e-3)
+    assert source.load("tilted pan").visual.vertices_m[:, 2].mean() > 0, "the handle is above"
+    notes = {name: set(source.notes[name]) & {"laid on its side", "y was up"} for name in source.names()}
+    assert notes == {
+        "ball": set(),
+        "lying pen": set(),
+        "plate on edge": {"laid on its side"},
+        "tilted pan": {"laid on its side"},
+    }
+
+
+def test_a_mujoco_model_is_read_with_includes_classes_and_solids(tmp_path: Path) -> None:
+    home = tmp_path / "blocks"
+    home.mkdir()
+    (home / "defaults.xml").write_text(
+        '<mujocoinclude><default><geom density="700"/><default class="small">'
+        '<geom type="box" size=".02 .02 .02"/>'
+        '<default class="ghost"><geom contype="0" conaffinity="0"/></default></default></default>'
+        "</mujocoinclude>"
+    )
+    (home / "blocks.xml").write_text(
+        '<mujoco><compiler angle="degree"/><include file="defaults.xml"/><worldbody>'
+        '<geom type="plane" size="1 1 1"/><body childclass="small" euler="0 0 90"><freejoint/>'
+        '<geom pos=".02 0 0"/><geom pos="-.02 0 0" rgba="0 0 1 1"/>'
+        '<geom class="ghost" pos="0 0 .01" group="4"/>'
+        "</body></worldbody></mujoco>"
+    )
+    (tmp_path / "ball.xml").write_text(
+        '<mujoco><worldbody><body><geom size="0.03" mass="0.1"/></body></worldbody></mujoco>'
+    )
+    (tmp_path / "can.sdf").write_text(
+        "<sdf version='1.6'><model name='can'><link name='a'><drake:x/><collision name='c'>"
+        "<pose>0 0 0 1.5708 0 0</pose>"
+        "<geometry><cylinder><radius>0.03</radius><length>0.1</length></cylinder></geometry></collision></link>"
+        "</model></sdf>"
+    )
+    source = FolderObjects(tmp_path)
+    blocks, can = source.load("blocks"), source.load("can")
+    np.testing.assert_allclose(blocks.size_m, (0.04, 0.08, 0.04), atol=1e-6)
+    assert len(blocks.convex_parts_m) == 2 and blocks.mass_kg == pytest.approx(700 * 2 * 0.04**3, rel=1e-5)
+    assert source.load("ball").mass_kg == 0.1
+    np.testing.assert_allclose(can.size_m, (0.06, 0.1, 0.06), atol=1e-3)  # it lies, as the file has it
