@@ -10,11 +10,11 @@ from cyclopts import App
 from datagen.assets.catalogue import CATALOGUE, select
 from datagen.assets.check import check_source, object_rows
 from datagen.assets.fetch import Fetched, fetch, refuse_full_disk
+from datagen.assets.object_sheet import draw_objects
 from datagen.assets.object_split import split_objects
 from datagen.console.options import AsJson, refuse_output
 from datagen.console.printing import print_json, print_lines, print_rows, size
 from datagen.display.progress import Progress, Seen
-from datagen.drawing.object_sheet import draw_objects
 from datagen.schemas.errors import InputError, choices
 from datagen.workers.content_cache import cache_folder
 

@@ -27,7 +27,6 @@ SUFFIXES = (".glb", ".obj", ".dae", ".ply", ".stl", ".msh")
 _MAX_BYTES = 256 << 20
 _FARTHEST = 1e6
 _FIX = "Export the mesh again"
-_SIMPLIFY = f"Simplify it to {MAX_FACES:,} faces"
 _PLAIN = np.array((178, 178, 178), np.uint8)
 # Side of each image in an atlas, by the most images that it then holds.
 _SIDES_PX = {4: 512, 16: 256, 64: 128}
@@ -56,17 +55,15 @@ class Surface:
         return replace(self, faces=self.faces[:, ::-1], uv=self.uv[:, ::-1])
 
     def painted(self, rgb: Sequence[float] | None, image: U8 | None = None) -> Surface:
-        """The surface with a colour (0 to 1) or an image for faces that have no image."""
-        bare = self.image < 0
+        """The surface with a colour (0 to 1) or an image for faces that have none of their own."""
+        bare = (self.image < 0) & (self.rgb == _PLAIN).all(axis=1)
         if image is not None and self.uv[bare].any():
             rows = np.where(bare, len(self.images), self.image)
             return replace(self, image=rows, images=(*self.images, image))
-        colour = None if rgb is None else np.rint(np.clip(rgb, 0, 1) * np.array(255.0))
-        return (
-            self
-            if colour is None
-            else replace(self, rgb=np.where(bare[:, None], colour, self.rgb).astype(np.uint8))
-        )
+        colours = self.rgb.copy()
+        if rgb is not None:
+            colours[bare] = _rgb_of(rgb)
+        return replace(self, rgb=colours)
 
 
 def joined(surfaces: Sequence[Surface]) -> Surface:
@@ -85,6 +82,10 @@ def joined(surfaces: Sequence[Surface]) -> Surface:
         tuple(image for s in surfaces for image in s.images),
         np.concatenate([*(s.cuts + face[k] for k, s in enumerate(surfaces)), face[1:-1]]),
     )
+
+
+def _rgb_of(colour: Sequence[float]) -> U8:
+    return np.rint(np.clip(colour, 0, 1) * np.array(255.0)).astype(np.uint8)
 
 
 def plain_surface(vertices: Any, faces: Any, rgb: Any = _PLAIN, cuts: Any = ()) -> Surface:
@@ -176,7 +177,7 @@ class SurfaceReader:
         for (start, name), end in zip(starts, [s for s, _ in starts[1:]] + [len(mesh.faces)], strict=True):
             if (material := materials.get(name)) is None:
                 continue
-            rgb[start:end] = np.rint(np.clip(material.rgb, 0, 1) * np.array(255.0))
+            rgb[start:end] = _rgb_of(material.rgb)
             if material.image and material.image not in rows:
                 pixels = self.image(path, material.image)
                 rows[material.image] = -1 if pixels is None else len(images)
@@ -254,7 +255,7 @@ def _checked(path: Path, surface: Surface) -> Surface:
     """The surface without faces of no area. Raises InputError for what no consumer could use."""
     faces = surface.faces
     if not 0 < len(faces) <= MAX_FACES:
-        raise InputError(path, "", f"has {len(faces):,} faces", _SIMPLIFY)
+        raise InputError(path, "", f"has {len(faces):,} faces", f"Simplify it to {MAX_FACES:,} faces")
     if faces.min() < 0 or faces.max() >= len(surface.vertices):
         raise InputError(path, "", "a face refers to a missing vertex", _FIX)
     if not (np.abs(surface.vertices) <= _FARTHEST).all():

@@ -248,7 +248,7 @@ def test_what_does_not_stand_is_laid_on_its_most_probable_side(tmp_path: Path) -
     assert notes == {
         "ball": set(),
         "lying pen": set(),
-        "plate on edge": {"laid on its side"},
+        "plate on edge": {"y was up"},
         "tilted pan": {"laid on its side"},
     }
 
