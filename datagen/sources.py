@@ -56,7 +56,7 @@ class Registry(Generic[T]):
 label_sources = Registry(LABEL_SOURCES, load_label_source)
 # Sources of houses: `houses["builtin"]`, `houses["procthor:DIR"]`.
 houses = Registry(HOUSE_SOURCES, open_houses)
-# Sources of objects: `objects["builtin"]`, `objects["ycb:DIR"]`.
+# Sources of objects: `objects["builtin"]`, `objects["folder:DIR"]`, `objects["ycb:DIR"]`.
 objects = Registry(OBJECT_SOURCES, open_objects)
 # Reach, mount height and base radius of each robot.
 robots = Registry(ROBOTS, robot_limits)

@@ -1,4 +1,4 @@
-"""`datagen assets`: list, fetch and split houses and objects."""
+"""`datagen assets`: list, fetch, check and split houses and objects."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from pathlib import Path
 from cyclopts import App
 
 from datagen.assets.catalogue import CATALOGUE, select
+from datagen.assets.check import check_source, object_rows
 from datagen.assets.fetch import Fetched, fetch, refuse_full_disk
+from datagen.assets.object_sheet import draw_objects
 from datagen.assets.object_split import split_objects
-from datagen.console.options import AsJson
-from datagen.console.printing import print_json, print_rows, size
+from datagen.console.options import AsJson, refuse_output
+from datagen.console.printing import print_json, print_lines, print_rows, size
 from datagen.display.progress import Progress, Seen
 from datagen.schemas.errors import InputError, choices
 from datagen.workers.content_cache import cache_folder
 
-app = App(name="assets", help="List, fetch and split houses and objects.")
+app = App(name="assets", help="List, fetch, check and split houses and objects.")
 
 
 @app.command(name="list")
@@ -39,6 +41,44 @@ def list_assets(*, json: AsJson = False) -> int:
         if asset.name not in scans[1:]  # one stands for all
     ]
     print_rows("assets for `datagen assets fetch`", rows)
+    return 0
+
+
+@app.command
+def check(source: str, /, *, picture: Path | None = None, json: AsJson = False) -> int:
+    """Read a folder of houses or objects as a job would: what is used, what is not and why, and its licences.
+
+    The result is cached, so that a job that uses the folder starts at once.
+
+    For example: datagen assets check my-objects --picture my-objects.png
+
+    Args:
+        source: Folder of houses or objects, or KIND:DIR as for --houses and --objects.
+        picture: Contact sheet of the objects to write, FILE.png.
+    """
+    if picture is not None:
+        refuse_output(picture, "--picture", ".png")
+    with Progress(json) as shown:
+        ref, survey, licences, objects = check_source(source, shown)
+    if picture is not None and objects is None:
+        raise InputError("--picture", str(picture), "is of objects, not of houses", "Omit it")
+    rows = [] if objects is None else object_rows(objects)
+    if json:
+        print_json({"source": ref, **asdict(survey), "objects": rows, "licences": licences})
+    else:
+        table = [
+            (
+                *(row["name"], " x ".join(f"{100 * side:.1f}" for side in row["size_m"])),
+                *(f"{row['mass_kg']:.3f}", str(row["parts"]), "yes" if row["can_be_target"] else ""),
+                "; ".join(f"{cause}: {detail}".removesuffix(": ") for cause, detail in row["notes"].items()),
+            )
+            for row in rows
+        ]
+        print_rows(ref, table, ("object", "size in cm", "kg", "parts", "target", "remarks"))
+        print_lines("\n".join(survey.lines(ref, with_reasons=True)))
+        print_lines(f"licences: {', '.join(licences) or 'none found'}")
+    if picture is not None and objects is not None:
+        draw_objects(objects, picture)
     return 0
 
 

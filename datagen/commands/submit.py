@@ -79,7 +79,9 @@ class SubmitOptions(JobOptions):
     houses: Annotated[
         str | None, option("builtin, procthor:DIR or ai2thor:DIR. [default: builtin]", LABELLED)
     ] = None
-    objects: Annotated[str | None, option("builtin or ycb:DIR. [default: builtin]", LABELLED)] = None
+    objects: Annotated[str | None, option("builtin, folder:DIR or ycb:DIR. [default: builtin]", LABELLED)] = (
+        None
+    )
     scenes_from: Annotated[
         str | Path | None, _path("Run whose scenes and candidates are labelled again.")
     ] = None
@@ -251,11 +253,10 @@ def _report(surveys: Mapping[str, Survey], options: SubmitOptions) -> None:
         source = f"{str(getattr(options, what)).partition(':')[0]} {what}"
         reasons = survey.unusable if options.dry_run else {}
         counts = {"read": survey.read, "unusable": survey.causes, "findings": survey.findings}
-        lines = [f"{source}: {survey}", *(f"  {name}: {reason}" for name, reason in reasons.items())]
         if options.json:
             progress.say("source", {"source": source, **counts, "reasons": reasons}, "")
         else:
-            for line in lines:
+            for line in survey.lines(source, with_reasons=options.dry_run):
                 progress.say("", {}, line)
 
 

@@ -34,6 +34,11 @@ class Survey:
         """Unusable houses or objects by cause, most frequent first: what a reason has before its colon."""
         return dict(Counter(map(_cause, self.unusable.values())).most_common())
 
+    def lines(self, source: str, *, with_reasons: bool) -> list[str]:
+        """What to print of a source: a line, and perhaps one for each unusable house or object."""
+        reasons = self.unusable.items() if with_reasons else ()
+        return [f"{source}: {self}", *(f"  {name}: {reason}" for name, reason in reasons)]
+
     def __str__(self) -> str:
         text = f"{self.read:,} read"
         if self.unusable:
@@ -47,7 +52,10 @@ def survey_sources(
     """Surveys of "houses" and "objects", without sources that have no files. `seen(done, of)` is called."""
     found = {"houses": _of_houses(houses, seen)}
     if objects.kind != "builtin":
-        found["objects"] = Survey(len(objects.names()) + len(objects.excluded), dict(objects.excluded), {})
+        notes: Mapping[str, Mapping[str, str]] = getattr(objects, "notes", {})
+        counted = Counter(cause for each in notes.values() for cause in each)
+        read = len(objects.names()) + len(objects.excluded)
+        found["objects"] = Survey(read, dict(objects.excluded), dict(counted.most_common()))
     return {what: survey for what, survey in found.items() if survey is not None}
 
 

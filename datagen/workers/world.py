@@ -137,7 +137,7 @@ def open_world(spec: Specification, houses: str, objects: str, robot: str = "") 
     """Open the sources that `houses` and `objects` name, and check that they are the specified ones.
 
     `robot` is the place of the robot's file, "" for one of the registry. Raises InputError if the content of
-    a source or of a robot differs from the specification, or if it holds too few houses, objects or targets.
+    a source or of a robot differs from the specification, or if it holds no house, object or target.
     """
     if spec.arm is not None and spec.arm.robot_digest is not None:
         remember(robot or spec.arm.robot, spec.arm.robot, spec.arm.robot_digest)
@@ -171,12 +171,5 @@ def assemble_world(
     if not targets:
         raise InputError(
             "--objects", objects_ref, "has no object that a gripper can grasp", "Add smaller objects"
-        )
-    if len(names) <= spec.scene.n_clutter:
-        raise InputError(
-            "--objects",
-            objects_ref,
-            f"has {len(names)} objects, too few for one target and {spec.scene.n_clutter} clutter objects",
-            "Add objects, or reduce the clutter (scene.n_clutter)",
         )
     return World(spec, houses, objects, house_ids, names, targets)

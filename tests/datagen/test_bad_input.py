@@ -50,7 +50,7 @@ OPTIONS: list[tuple[str, list[str]]] = [
     ("--houses procthor:{file}", ["{file}", "no such folder"]),
     ("--houses procthor:{empty}", ["{empty}", "asset_sizes.json"]),
     ("--houses ai2thor:{empty}", ["{empty}", "ai2thor-hab"]),
-    ("--objects toys", ["toys", "builtin, ycb"]),
+    ("--objects toys", ["toys", "builtin, folder, ycb"]),
     ("--objects builtin:x", ["builtin:x", "no folder"]),
     ("--objects ycb", ["ycb", "ycb:DIR"]),
     ("--objects ycb:{missing}", ["{missing}"]),

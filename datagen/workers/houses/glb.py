@@ -29,7 +29,7 @@ _FIX = "Download the asset again, or remove the scenes that use it."
 # Exceptions of trimesh, which checks little itself, for damaged files: dangling references, values of wrong
 # types, short buffers, cyclic nodes, textures that Pillow cannot read (OSError) or refuses for their size,
 # a stride of 0, numbers beyond 64 bits, compressed meshes (NotImplementedError).
-_DAMAGE = (
+DAMAGE = (
     ValueError, LookupError, TypeError, AttributeError, OSError, struct.error, RecursionError,
     NotImplementedError, ArithmeticError, AssertionError, Image.DecompressionBombError,
 )  # fmt: skip
@@ -40,22 +40,34 @@ def read_glb(path: Path) -> Mesh:
 
     Raises InputError for files that are missing, damaged, empty or beyond the limits.
     """
-    # Imported here: only AI2-THOR houses and robots need it.
+    try:
+        return _merged(read_pieces(path, "glb"))
+    except DAMAGE as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(path, "", f"is a damaged glTF file ({type(error).__name__})", _FIX) from None
+
+
+def read_pieces(path: Path, kind: str, resolver: Any = None) -> list[Any]:
+    """The meshes of trimesh that a file of a kind ("glb", "ply", ..) holds, each placed as in its scene.
+
+    From memory: of other files only what `resolver` gives is read. Raises InputError as `read_glb` does, or
+    one of `DAMAGE`.
+    """
+    # Imported here: only AI2-THOR houses, robots and some objects need it.
     import trimesh
 
     data = read_regular(path, MAX_FILE_BYTES, _FIX)
-    refuse_other_kind(path, data, "a binary glTF file", _FIX)
-    _check_header(path, data)
-    try:
-        # From memory, so that no reference to another file is followed.
-        scene = cast(Any, trimesh.load_scene(io.BytesIO(data), file_type="glb", skip_materials=False))
-        placed = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
-        # Counted before meshes are copied for each instance.
-        count = sum(len(m.faces) for m in placed if isinstance(m, trimesh.Trimesh))
-        if 0 < count <= MAX_FACES:
-            return _merged([m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)])
-    except _DAMAGE as error:
-        raise InputError(path, "", f"is a damaged glTF file ({type(error).__name__})", _FIX) from None
+    if kind == "glb":
+        refuse_other_kind(path, data, "a binary glTF file", _FIX)
+        _check_header(path, data)
+    options: dict[str, Any] = {"skip_materials": False} if kind == "glb" else {"process": False}
+    scene = cast(Any, trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, **options))
+    placed = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
+    # Counted before meshes are copied for each instance.
+    count = sum(len(m.faces) for m in placed if isinstance(m, trimesh.Trimesh))
+    if 0 < count <= MAX_FACES:
+        return [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]
     problem = "no triangles" if count == 0 else f"{count} triangles, more than {MAX_FACES}"
     raise InputError(path, "", problem, _FIX)
 

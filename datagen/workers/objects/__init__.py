@@ -1,4 +1,4 @@
-"""Movable objects: `open_objects("builtin")` or `open_objects("ycb:DIR")`."""
+"""Movable objects: `open_objects("builtin")`, `open_objects("folder:DIR")` or `open_objects("ycb:DIR")`."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ __all__ = ["OBJECT_SOURCES", "ObjectModel", "ObjectSource", "open_objects"]
 # Each function accepts the text after the first colon of a reference, "" if there is none.
 OBJECT_SOURCES: dict[str, str] = {
     "builtin": "datagen.workers.objects.builtin:open_builtin",
+    "folder": "datagen.workers.objects.folder:open_folder",
     "ycb": "datagen.workers.objects.ycb:open_ycb",
 }
 
 
 def open_objects(ref: str) -> ObjectSource:
-    """The source that a reference names: `builtin`, or `ycb:DIR` with a folder of objects.
+    """The source that a reference names: `builtin`, or `folder:DIR` or `ycb:DIR` with a folder of objects.
 
     Raises InputError for an unknown kind, naming the valid ones, and as the source itself does.
     """

@@ -58,7 +58,7 @@ def read_convex_parts(path: Path) -> ConvexParts:
         mesh = read_obj(path)
         vertices, groups = mesh.vertices, mesh.group_faces()
     if len(groups) == 1:
-        groups = _components(groups[0], len(vertices))
+        groups = components(groups[0], len(vertices))
     if len(groups) > MAX_PARTS:
         raise InputError(
             path,
@@ -67,7 +67,7 @@ def read_convex_parts(path: Path) -> ConvexParts:
             "Merge them to a coarser decomposition",
         )
     for number, faces in enumerate(groups, 1):
-        if problem := _not_convex(vertices, faces):
+        if problem := not_convex(vertices, faces):
             fix = "Give a convex decomposition, one `o` group for each part, not the visual mesh"
             raise InputError(path, f"part {number}", problem, fix)
     parts = convex_parts(vertices[np.unique(faces)] for faces in groups)
@@ -91,7 +91,7 @@ def convex_parts(points_m: Iterable[npt.NDArray[np.floating]]) -> ConvexParts:
     return ConvexParts(tuple(kept), volume)
 
 
-def _not_convex(vertices: F64, faces: npt.NDArray[np.int64]) -> str:
+def not_convex(vertices: F64, faces: npt.NDArray[np.int64]) -> str:
     """The problem of a part that its hull does not stand for; "" if the hull does, or the part is flat."""
     points_m = vertices[np.unique(faces)]
     if len(points_m) > MAX_PART_VERTICES:
@@ -136,7 +136,8 @@ def _read_ply(path: Path) -> tuple[F64, list[npt.NDArray[np.int64]]]:
     return vertices, [faces]
 
 
-def _components(faces: npt.NDArray[np.int64], n_vertices: int) -> list[npt.NDArray[np.int64]]:
+def components(faces: npt.NDArray[np.int64], n_vertices: int) -> list[npt.NDArray[np.int64]]:
+    """The faces (F, 3) of each piece that shares no vertex with others."""
     of_face = vertex_components(faces, n_vertices)[faces[:, 0]]
     order = np.argsort(of_face, kind="stable")
     cuts = np.flatnonzero(np.diff(of_face[order])) + 1

@@ -1,10 +1,11 @@
-"""Wavefront MTL: the one texture image of a mesh."""
+"""Wavefront MTL: colours and texture images of a mesh."""
 
 from __future__ import annotations
 
 import re
 import shlex
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from datagen.schemas.errors import InputError
@@ -29,22 +30,38 @@ _WORDS = {
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 
-def texture_of_materials(library: Path, used: Sequence[str]) -> str:
-    """The image that a material library gives to the used materials, or to all where none is named.
+@dataclass
+class Material:
+    """A colour (0 to 1), and the file name of an image that covers it, "" without one."""
 
-    Raises InputError naming the library: missing, or a material with a colour alone, or with another image.
-    """
+    rgb: tuple[float, ...] = (0.7, 0.7, 0.7)
+    image: str = ""
+
+
+def read_materials(library: Path) -> dict[str, Material]:
+    """The materials of a library by name. Raises InputError naming the library and the line."""
     data = read_regular(library, _MAX_BYTES, "Put the mesh's material library next to it")
     refuse_other_kind(library, data, "text", _BAKE)
-    images: dict[str, str] = {}
+    found: dict[str, Material] = {}
     material = ""
     for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
         keyword, value = ([*line.split(None, 1), "", ""])[:2]
         if keyword == "newmtl":
             material = value.strip()
-            images.setdefault(material, "")
+            found.setdefault(material, Material())
         elif keyword == "map_Kd":
-            images[material] = _image_name(library, number, value)
+            found.setdefault(material, Material()).image = _image_name(library, number, value)
+        elif keyword == "Kd" and all(map(_NUMBER.fullmatch, words := value.split()[:3])) and len(words) == 3:
+            found.setdefault(material, Material()).rgb = tuple(map(float, words))
+    return found
+
+
+def texture_of_materials(library: Path, used: Sequence[str]) -> str:
+    """The image that a material library gives to the used materials, or to all where none is named.
+
+    Raises InputError naming the library: missing, or a material with a colour alone, or with another image.
+    """
+    images = {name: material.image for name, material in read_materials(library).items()}
     named = [name for name in used if name in images] or list(images)
     found = {images[name] for name in named}
     if "" in found:

@@ -43,6 +43,9 @@ class ObjMesh:
     group_starts: I64  # (G,) index of the first face of each `o` (or else `g`) group
     material_library: str = ""
     materials: tuple[str, ...] = ()  # those of its faces, by first use
+    material_starts: tuple[
+        tuple[int, str], ...
+    ] = ()  # index of the first face that has it, in the file's order
 
     def group_faces(self) -> list[I64]:
         """The faces of each named group that has any; all faces as one group where none is named."""
@@ -111,6 +114,7 @@ def read_obj(path: Path) -> ObjMesh:
         np.array(starts[b"o"] or starts[b"g"], np.int64),
         library,
         _of_faces(materials, len(faces) // 3),
+        tuple(materials),
     )
     _check_indices(path, mesh)
     return mesh

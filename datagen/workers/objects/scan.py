@@ -14,8 +14,9 @@ from datagen.schemas.identity import digest_of
 from datagen.schemas.safe_files import open_regular
 from datagen.workers.content_cache import Arrays, CacheFolder
 from datagen.workers.geometry.mesh import F32, Mesh, Texture
-from datagen.workers.objects.convex import ConvexParts, read_convex_parts
+from datagen.workers.objects.convex import ConvexParts, fits_gripper, read_convex_parts
 from datagen.workers.objects.materials import texture_of_materials
+from datagen.workers.objects.model import ObjectModel
 from datagen.workers.objects.obj_file import MAX_FILE_BYTES, ObjMesh, read_obj
 from datagen.workers.objects.texture import face_colours, read_texture
 
@@ -27,7 +28,7 @@ _CACHE_VERSION = 2
 _STANDS_M = (0.01, 0.015)
 MIN_SIZE_M = 0.002
 MAX_SIZE_M = 2.0
-_CACHE = CacheFolder("objects", most_files=1024)
+CACHE = CacheFolder("objects", most_files=4096)
 _VOLUMES = CacheFolder("volumes", most_files=64)
 
 
@@ -65,11 +66,11 @@ def load_scan(files: ScanFiles) -> Scan:
     Raises InputError as `read_scan` does; an unusable cache costs only time.
     """
     key = f"{files.digest}-{_CACHE_VERSION}"
-    stored = _CACHE.load(key)
+    stored = CACHE.load(key)
     if stored is not None:
-        return _restored(stored)
+        return restored_scan(stored)
     scan = read_scan(files.visual, files.texture, files.collision)
-    _CACHE.store(key, _stored(scan))
+    CACHE.store(key, stored_scan(scan))
     return scan
 
 
@@ -154,15 +155,15 @@ def _split_seams(mesh: ObjMesh) -> tuple[np.ndarray, F32, np.ndarray]:
     return (mesh.vertices[vertex], mesh.uv[uv].astype(np.float32), faces.reshape(-1, 3).astype(np.int32))
 
 
-def _stored(scan: Scan) -> Arrays:
+def stored_scan(scan: Scan) -> Arrays:
+    """The arrays of a scan, as caches hold them."""
     texture = scan.visual.texture
-    assert texture is not None
+    textured = {} if texture is None else {"image": texture.image, "uv": texture.uv}
     return {
         "vertices": scan.visual.vertices_m,
         "faces": scan.visual.faces,
         "face_rgb": scan.visual.face_rgb,
-        "image": texture.image,
-        "uv": texture.uv,
+        **textured,
         "part_vertices": np.concatenate(scan.parts.vertices_m),
         "part_cuts": np.cumsum([len(part) for part in scan.parts.vertices_m])[:-1],
         "volume": np.array(scan.parts.volume_m3, np.float64),
@@ -170,12 +171,27 @@ def _stored(scan: Scan) -> Arrays:
     }
 
 
-def _restored(stored: Arrays) -> Scan:
-    texture = Texture(stored["image"], stored["uv"])
+def restored_scan(stored: Arrays) -> Scan:
+    """The scan of the arrays that `stored_scan` returns."""
+    texture = Texture(stored["image"], stored["uv"]) if "image" in stored else None
     parts = tuple(np.split(stored["part_vertices"], stored["part_cuts"]))
     width, depth, height = (float(length) for length in stored["size_m"])
     return Scan(
         Mesh(stored["vertices"], stored["faces"], stored["face_rgb"], texture),
         ConvexParts(parts, float(stored["volume"])),
         (width, depth, height),
+    )
+
+
+def model_of(name: str, digest: str, mass_kg: float, scan: Scan) -> ObjectModel:
+    """The object of a scan."""
+    return ObjectModel(
+        name=name,
+        digest=digest,
+        mass_kg=mass_kg,
+        size_m=scan.size_m,
+        radius_m=float(np.linalg.norm(scan.visual.vertices_m.astype(np.float64), axis=1).max()),
+        visual=scan.visual,
+        convex_parts_m=scan.parts.vertices_m,
+        can_be_target=fits_gripper(scan.visual.vertices_m, scan.parts, mass_kg),
     )

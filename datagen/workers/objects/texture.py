@@ -40,24 +40,25 @@ def read_texture(path: Path) -> U8:
             # Our own limit, checked below, is stricter than the one that warns.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(file, formats=("JPEG", "PNG")) as image:
-                width, height = image.size
-                if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS:
-                    raise InputError(
-                        path,
-                        "",
-                        f"the image has {width}x{height} pixels",
-                        f"Give at most {MAX_PIXELS:,} pixels",
-                    )
-                image.draft("RGB", (KEPT_SIDE_PX, KEPT_SIDE_PX))
-                pixels = rgb_of(image)
-                pixels.thumbnail((KEPT_SIDE_PX, KEPT_SIDE_PX), Image.Resampling.BOX)
-                return np.asarray(pixels, np.uint8)
+                return reduced_image(image, path)
     except InputError:
         raise
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(
             path, "", f"not a readable JPEG or PNG image ({type(error).__name__})", "Fetch the asset again"
         ) from error
+
+
+def reduced_image(image: Image.Image, path: Path) -> U8:
+    """The pixels (H, W, 3), as `read_texture` returns them. Raises InputError naming the file."""
+    width, height = image.size
+    if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS:
+        problem, fix = f"the image has {width}x{height} pixels", f"Give at most {MAX_PIXELS:,} pixels"
+        raise InputError(path, "", problem, fix)
+    image.draft("RGB", (KEPT_SIDE_PX, KEPT_SIDE_PX))
+    pixels = rgb_of(image)
+    pixels.thumbnail((KEPT_SIDE_PX, KEPT_SIDE_PX), Image.Resampling.BOX)
+    return np.asarray(pixels, np.uint8)
 
 
 def rgb_of(image: Image.Image) -> Image.Image:

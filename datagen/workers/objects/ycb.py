@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
-from datagen.workers.objects.convex import fits_gripper
 from datagen.workers.objects.exclusions import reason_to_exclude
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.objects.scan import READER_VERSION, Scan, load_scan, volumes_m3
+from datagen.workers.objects.scan import READER_VERSION, load_scan, model_of, volumes_m3
 from datagen.workers.objects.ycb_layouts import Entry, read_layout
 from datagen.workers.source_statement import read_statement
 
@@ -65,25 +62,14 @@ class YcbObjects:
                 reason = self.excluded.get(name, "there is no such object")
                 raise InputError("ycb objects", name, reason, "See `names()` for those that can be used")
             entry, mass_kg = self._entries[name]
-            model = self._models[name] = _model(entry, mass_kg, load_scan(entry.files))
+            model = self._models[name] = model_of(
+                name, _digest(entry, mass_kg), mass_kg, load_scan(entry.files)
+            )
         return model
 
 
 def _digest(entry: Entry, mass_kg: float) -> str:
     return digest_of([entry.files.digest, float(mass_kg).hex(), READER_VERSION])
-
-
-def _model(entry: Entry, mass_kg: float, scan: Scan) -> ObjectModel:
-    return ObjectModel(
-        name=entry.name,
-        digest=_digest(entry, mass_kg),
-        mass_kg=mass_kg,
-        size_m=scan.size_m,
-        radius_m=float(np.linalg.norm(scan.visual.vertices_m.astype(np.float64), axis=1).max()),
-        visual=scan.visual,
-        convex_parts_m=scan.parts.vertices_m,
-        can_be_target=fits_gripper(scan.visual.vertices_m, scan.parts, mass_kg),
-    )
 
 
 def open_ycb(folder: str) -> YcbObjects:

@@ -25,6 +25,7 @@ from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG
 MAX_INDEX_BYTES = 16 * 2**20
 MAX_OBJECTS = 10_000
 MANISKILL_INDEXES = ("info_pick_v0.json", "info_raw.json")
+INDEXES = ("objects.json", *MANISKILL_INDEXES)
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]{0,99}$")]
 _Mass = Annotated[float, Field(gt=0, le=50, allow_inf_nan=False)]
@@ -78,7 +79,7 @@ def read_layout(folder: Path) -> tuple[Path, list[Entry]]:
         index = folder / name
         if index.is_file():
             return index, _maniskill(folder, index)
-    wanted = ", ".join(("objects.json", *MANISKILL_INDEXES))
+    wanted = ", ".join(INDEXES)
     raise InputError(
         folder,
         "",

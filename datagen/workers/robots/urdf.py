@@ -10,11 +10,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.safe_files import read_regular
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.robots.resources import mesh_path
+from datagen.workers.xml_file import read_xml
 
-_MAX_BYTES = 8 << 20
 _MAX_LINKS, _LONGEST, _LONGEST_PATH = 1000, 200, 1000
 MOST = 1e6  # of a number, whose squares and products stay finite
 FIX = "Correct the file, or install its package again"
@@ -42,6 +41,7 @@ class Shape:
     scale: F64  # (3,) of the mesh
     path: Path  # of the URDF, and the shape in it
     where: str
+    rgb: tuple[float, ...] | None = None  # of its material, 0 to 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,13 +153,7 @@ def read_urdf(path: Path) -> UrdfTree:
     Raises InputError naming the file and the element: unreadable, not XML, a number that is not
     finite or too large, a joint between links that do not exist, two parents of one link, a loop.
     """
-    data = read_regular(path, _MAX_BYTES, FIX)
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise _wrong(path, "", "declares a document type; a URDF has none")
-    try:
-        root = ElementTree.fromstring(data)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise _wrong(path, "", f"is not XML ({error})") from error
+    root = read_xml(path, FIX)
     if any("ros.org/wiki/xacro}" in element.tag for element in root.iter()) or path.suffix == ".xacro":
         command = f"xacro {path.name} > {path.name.split('.')[0]}-expanded.urdf"
         raise InputError(path, "", "is a xacro file", f"Expand it, and name the result: {command}")
@@ -167,7 +161,7 @@ def read_urdf(path: Path) -> UrdfTree:
         raise _wrong(path, root.tag[:80], "is not <robot>")
     if max(len(root.findall("link")), len(root.findall("joint"))) > _MAX_LINKS:
         raise _wrong(path, "", f"has more than {_MAX_LINKS:,} links or joints")
-    reader = _Reader(path)
+    reader = _Reader(path, root)
     links = {link.name: link for link in map(reader.link, root.findall("link"))}
     joints = {joint.name: joint for joint in map(reader.joint, root.findall("joint"))}
     for joint in joints.values():
@@ -192,8 +186,9 @@ _SIZES = {"box": [("size", 3)], "cylinder": [("radius", 1), ("length", 1)], "sph
 
 
 class _Reader:
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, root: ElementTree.Element) -> None:
         self.path = path
+        self.colours = {m.get("name"): m.find("color") for m in root.findall("material")}
 
     def name(self, element: ElementTree.Element) -> str:
         name = element.get("name", "")
@@ -253,14 +248,14 @@ class _Reader:
         return Inertial(mass, T[:3, 3], R @ inertia @ R.T) if mass > 0 else None
 
     def shape(self, element: ElementTree.Element, where: str) -> Shape:
-        T = self.origin(element, where)
+        T, rgb = self.origin(element, where), self.rgb(element.find("material"), where)
         for kind, keys in _SIZES.items():
             solid = element.find(f"geometry/{kind}")
             if solid is not None:
                 size_m = np.concatenate([self.numbers(solid, key, n, where, "") for key, n in keys])
                 if not (size_m > 0).all():
                     raise _wrong(self.path, where, f"its {kind} has no volume")
-                return Shape(T, size_m, None, np.ones(3), self.path, where)
+                return Shape(T, size_m, None, np.ones(3), self.path, where, rgb)
         mesh = element.find("geometry/mesh")
         if mesh is None:
             raise _wrong(self.path, where, f"has no {', '.join(_SIZES)} or mesh")
@@ -269,7 +264,13 @@ class _Reader:
             raise _wrong(self.path, where, f"its mesh has a path of {len(text):,} characters")
         file = mesh_path(text, self.path)
         scale = self.numbers(mesh, "scale", 3, where, "1 1 1")
-        return Shape(T, None, file, scale, self.path, where)
+        return Shape(T, None, file, scale, self.path, where, rgb)
+
+    def rgb(self, material: ElementTree.Element | None, where: str) -> tuple[float, ...] | None:
+        colour = None if material is None else material.find("color")
+        if colour is None and material is not None:
+            colour = self.colours.get(material.get("name"))
+        return None if colour is None else tuple(self.numbers(colour, "rgba", 4, where, "1 1 1 1")[:3])
 
     def joint(self, element: ElementTree.Element) -> Joint:
         name = self.name(element)

@@ -167,13 +167,13 @@ def _load_house(world: World, house_id: str) -> PreparedHouse:
 
 
 def _draw_names(world: World, rng: np.random.Generator, clock: StageClock) -> list[str]:
-    """The target first, then clutter, all different."""
+    """The target first, then clutter, all different unless there are fewer objects than the scene needs."""
     with clock.stage("draw" if world.spec.arm is None else "grasps"):
         target = world.draw_target(rng)
-    others = [name for name in world.object_names if name != target]
+    others = [name for name in world.object_names if name != target] or [target]
     scene = world.spec.scene
     size = scene.n_clutter if scene.places is None else int(rng.integers(scene.n_clutter + 1))
-    clutter = rng.choice(len(others), size=size, replace=False)
+    clutter = rng.choice(len(others), size=size, replace=size > len(others))
     return [target, *(others[k] for k in clutter)]
 
 
