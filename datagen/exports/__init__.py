@@ -8,6 +8,6 @@ FORMATS: dict[str, str] = {
     "huggingface": "datagen.exports.huggingface:steps",
     "lerobot": "datagen.exports.lerobot:steps",
     "parquet": "datagen.exports.parquet:steps",
-    "rerun": "datagen.exports.rerun:steps",
+    "rerun": "datagen.exports.rerun_recording:steps",
     "webdataset": "datagen.exports.webdataset:steps",
 }

@@ -1,5 +1,9 @@
 """Scenes as recordings of Rerun: house, objects, cloud, camera, candidates, and the best trial."""
 
+# Where Rerun is not installed, which most environments lack, its types are unknown.
+# pyright: reportMissingImports=false, reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownParameterType=false, reportUnknownArgumentType=false
+
 from __future__ import annotations
 
 import struct
