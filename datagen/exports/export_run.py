@@ -167,7 +167,7 @@ def export_run(
 ) -> tuple[Storage, ExportRecord]:
     """Write the files of an export; those that a former call has written are kept where they are intact.
 
-    `seen` is told the steps that are done, of all. InputError for an unknown format, for a folder with other
+    `seen` receives the number of steps done, and of all. InputError for an unknown format, for a folder with other
     files or another export, and for scenes that cannot be read.
     """
     steps: Sequence[Step] = registry.entry(FORMATS, to, "--to")(source)
