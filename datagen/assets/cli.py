@@ -8,9 +8,7 @@ from pathlib import Path
 from cyclopts import App
 
 from datagen.assets.catalogue import CATALOGUE, select
-from datagen.assets.check import check_source, object_rows
 from datagen.assets.fetch import Fetched, fetch, refuse_full_disk
-from datagen.assets.object_sheet import draw_objects
 from datagen.assets.object_split import split_objects
 from datagen.console.options import AsJson, refuse_output
 from datagen.console.printing import print_json, print_lines, print_rows, size
@@ -56,6 +54,10 @@ def check(source: str, /, *, picture: Path | None = None, json: AsJson = False) 
         source: Folder of houses or objects, or KIND:DIR as for --houses and --objects.
         picture: Contact sheet of the objects to write, FILE.png.
     """
+    # Imported here: the other verbs of assets need no libraries of meshes.
+    from datagen.assets.check import check_source, object_rows
+    from datagen.assets.object_sheet import draw_objects
+
     if picture is not None:
         refuse_output(picture, "--picture", ".png")
     with Progress(json) as shown:

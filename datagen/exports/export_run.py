@@ -167,8 +167,8 @@ def export_run(
 ) -> tuple[Storage, ExportRecord]:
     """Write the files of an export; those that a former call has written are kept where they are intact.
 
-    `seen` receives the number of steps done, and of all. InputError for an unknown format, for a folder with other
-    files or another export, and for scenes that cannot be read.
+    `seen` receives the number of steps done, and of all. InputError for an unknown format, for a folder with
+    other files or another export, and for scenes that cannot be read.
     """
     steps: Sequence[Step] = registry.entry(FORMATS, to, "--to")(source)
     about, run = source.about, open_storage(source.path, probe=False, create=False)
