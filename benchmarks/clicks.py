@@ -26,19 +26,15 @@ import numpy.typing as npt
 from PIL import Image
 from scipy import ndimage
 
+from benchmarks.options import drawn_scenes
 from datagen.schemas.errors import InputError
-from datagen.schemas.run_records import StageClock
-from datagen.schemas.specification import NoiseParams, Source, Specification
+from datagen.schemas.specification import NoiseParams
 from datagen.train.prediction.frames import Pinhole, RgbdImage, read_place
 from datagen.train.prediction.region_growing import grow_mask
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.houses import open_houses
-from datagen.workers.objects import open_objects
 from datagen.workers.rendering import Frame
 from datagen.workers.rendering.embree import RayScene, render_rays
 from datagen.workers.rendering.noise import add_noise
-from datagen.workers.scenes.generate import generate_scene
-from datagen.workers.world import assemble_world
 
 Labels = npt.NDArray[np.int64]
 ROOM, LEAST_PX, CLICKS = 65535, 300, 5
@@ -135,12 +131,7 @@ def _folders(folders: list[Path]) -> Iterator[Case]:
 
 
 def _scenes(options: argparse.Namespace) -> Iterator[Case]:
-    opened = open_houses(options.houses), open_objects(options.objects)
-    house, thing = (Source(kind=source.kind, digest=source.digest) for source in opened)
-    spec = Specification(seed=options.seed, split="test", houses=house, objects=thing)
-    world = assemble_world(spec, *opened, options.houses, options.objects)
-    for index in range(options.scenes):
-        scene, _ = generate_scene(world, index, StageClock())
+    for index, scene in drawn_scenes(options):
         for kind, rays in (("rendered", scene.rays), ("stacked", _stacked(scene.rays))):
             exact = render_rays(rays, scene.camera)
             for name, params in _noises(scene.camera.fx_px).items():

@@ -17,21 +17,17 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from benchmarks.options import drawn_scenes
 from datagen.schemas.errors import InputError
-from datagen.schemas.run_records import StageClock
-from datagen.schemas.specification import NoiseParams, Source, Specification
+from datagen.schemas.specification import NoiseParams
 from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
 from datagen.train.prediction.ground import find_ground, floor_points
 from datagen.train.prediction.region_growing import grow_mask
 from datagen.train.prediction.target import locate
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.houses import open_houses
-from datagen.workers.objects import open_objects
 from datagen.workers.rendering.embree import render_rays
 from datagen.workers.rendering.noise import add_noise
 from datagen.workers.scenes import Scene
-from datagen.workers.scenes.generate import generate_scene
-from datagen.workers.world import assemble_world
 
 
 def main() -> None:
@@ -76,12 +72,7 @@ def main() -> None:
 
 
 def _scenes(options: argparse.Namespace) -> Iterator[tuple[Scene, dict[str, SensorFrame | None]]]:
-    opened = open_houses(options.houses), open_objects(options.objects)
-    house, thing = (Source(kind=source.kind, digest=source.digest) for source in opened)
-    spec = Specification(seed=options.seed, split="test", houses=house, objects=thing)
-    world = assemble_world(spec, *opened, options.houses, options.objects)
-    for index in range(options.scenes):
-        scene, _ = generate_scene(world, index, StageClock())
+    for index, scene in drawn_scenes(options):
         exact = render_rays(scene.rays, scene.camera)
         noisy = add_noise(exact, NoiseParams(enabled=True), np.random.default_rng([options.seed, index]))
         frames: dict[str, SensorFrame | None] = {}

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.evaluation.benchmark import read_benchmark
-from datagen.schemas.errors import InputError
+from datagen.schemas.errors import InputError, choices
 
 FOLDER = Path(__file__).resolve().parent.parent / "leaderboard"
 _ROBOTS = {"stretch3": "Stretch 3", "ur5": "UR5", "tiago-pro": "TIAGo Pro", "pr2": "PR2"}
@@ -53,7 +53,10 @@ def entry_of(report: dict[str, Any], method: str, about: str) -> dict[str, Any]:
     ):
         command = "datagen benchmark score METHOD --runs RUNS --out BOARD.json"
         raise InputError("BOARD", "benchmark", "is not this version with all of its runs", f"Run {command}")
-    (found,) = [m for m in report["methods"] if m["name"] == method]
+    methods = {each["name"]: each for each in report["methods"]}
+    if method not in methods:
+        raise InputError("METHOD", method, "is not in the report", choices(methods, method))
+    found = methods[method]
     parts = {part["title"]: part for part in report["parts"]}
     grids = {title: _picks(part["grids"], method) for title, part in parts.items() if part["grids"]}
     decisions = {run: _decisions(parts[run]["sets"]["in-range"]["methods"][method]) for run in _RUNS}
@@ -167,6 +170,13 @@ def main(words: list[str]) -> None:
     if not words:
         sys.stdout.write(page())
         return
+    if len(words) != 4:
+        raise InputError(
+            "leaderboard_page",
+            " ".join(words)[:80],
+            "has not four words",
+            "Give BOARD.json METHOD NAME ABOUT",
+        )
     board, method, name, about = words
     found = entry_of(json.loads(Path(board).read_text("utf-8")), method, about)
     FOLDER.mkdir(exist_ok=True)
@@ -174,4 +184,8 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    try:
+        main(sys.argv[1:])
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

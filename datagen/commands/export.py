@@ -14,9 +14,12 @@ from datagen.exports.export_run import export_run, open_source
 
 def print_export(report: dict[str, Any], json: bool, **_: Any) -> int:
     """Print the report of an export."""
+    if json:
+        print_json(report)
+        return 0
     files = f"{counted(report['files'], 'file')}, {size(report['bytes'])}"
     rows = [("scenes", f"{report['scenes']:,}"), ("files", files), ("licences", report["license"])]
-    print_json(report) if json else print_rows(f"{report['format']}: {report['out']}", rows)
+    print_rows(f"{report['format']}: {report['out']}", rows)
     return 0
 
 

@@ -28,6 +28,8 @@ def test_a_method_becomes_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     pack = read_benchmark(Path(shipped_pack()))
     monkeypatch.setattr(leaderboard_page, "read_benchmark", lambda _: pack)
     monkeypatch.setattr(leaderboard_page, "FOLDER", tmp_path / "entries")
+    with pytest.raises(InputError, match="Did you mean proximity"):
+        leaderboard_page.main([str(board), "proximty", "rule", "a rule"])
     for method in ("proximity", "reach-share"):
         leaderboard_page.main([str(board), method, method, f"about {method}"])
     part = json.loads(board.read_text())["parts"][0]

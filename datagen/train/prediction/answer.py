@@ -124,7 +124,7 @@ class Prediction:
     def good_share(self) -> float | None:
         """Share of the clear base poses within the arm's reach that score good; None where there are none.
 
-        Where it is high, parking decides little: a simple rule does nearly as well.
+        Within reach: from the arm's mount to the target's centre. Where it is high, parking decides little.
         """
         rise_m = self.target.center_m[2] - self.robot.base_height_m
         rows = self.rows("clear")
