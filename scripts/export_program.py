@@ -21,7 +21,7 @@ from torch.fx import Node
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import whole_file
 from datagen.train.hands.poses import HAND_WIDTH
-from datagen.train.hands.reach import N_STAGES
+from datagen.train.hands.reach import N_CODES
 from datagen.train.headings import trained_side_deg
 from datagen.train.inputs import Array, Clouds, RobotInputs
 from datagen.train.models.crop import crop_clouds, take_rows
@@ -136,7 +136,7 @@ def write_program(checkpoint: Path, out: Path) -> None:
     cloud += (torch.ones(1, dtype=torch.int64), *(torch.ones(1) for _ in range(3)))
     with torch.no_grad():
         candidates = (torch.zeros(1), torch.ones(1), torch.zeros(1, k, HAND_WIDTH), torch.ones(AT_ONCE, 2))
-        candidates += (torch.zeros(AT_ONCE), torch.zeros(AT_ONCE, k, N_STAGES, dtype=u8))
+        candidates += (torch.zeros(AT_ONCE), torch.zeros(AT_ONCE, k, N_CODES, dtype=u8))
         encode, constants = exported(ENCODE, Encode(model), CLOUD, cloud)
         of_cloud = tuple(each.clone() for each in Encode(model)(*cloud))
         score, more = exported(SCORE, Score(model), TOKENS + TO_SCORE, (*of_cloud, *candidates))

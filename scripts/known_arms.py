@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from datagen.train.hands.sizes import measured_hand
-from datagen.workers.motion.measured_reach import measured_arm, reaches_of, size_row
+from datagen.workers.motion.arm_links import RADIUS, TREE
+from datagen.workers.motion.measured_reach import link_spheres, measured_arm, reaches_of, size_row
 from datagen.workers.motion.pose_reach import KNOWN_ARMS
 from datagen.workers.robots import ROBOTS, gripper_of, robot_digest
 
@@ -28,6 +29,9 @@ def known_arms() -> dict[str, Any]:
         found[f"{name}/reach_m"] = reaches_m
         found[f"{name}/size"] = np.array([size_row(arm) for arm in arms])
         found[f"{name}/code"] = arms[0].code
+        tree, radius_m = link_spheres(name)
+        found |= {f"{name}/{TREE}{field}": values for field, values in tree._asdict().items()}
+        found[f"{name}/{RADIUS}"] = radius_m
     return found
 
 

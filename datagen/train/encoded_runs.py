@@ -29,7 +29,7 @@ from datagen.train.models.tokens import EncodedCandidates, EncodedClouds, pack, 
 from datagen.train.tensors import to_torch
 
 # Raise it when the same run would give other tokens or columns.
-_VERSION = 3
+_VERSION = 4
 # Fields of a model's configuration that decide its tokens.
 _DECISIVE = (
     "n_points",
@@ -200,7 +200,7 @@ def _write(stream: SampleStream, model: SharedModel, place: Path, seen: Callable
                 if model.sizes.observed_visibility:
                     seen_by = (made, given.clouds, given.candidates, given.robots)
                     share = model.visible_share(*seen_by).numpy()
-                reach = model.hand_reach(made, given.candidates, given.robots)
+                reach = model.hand_reach(made, given.clouds, given.candidates, given.robots)
             file.write(tokens.numpy().tobytes())
             poses = made.hand_poses if made.hand_poses is not None else torch.zeros(len(batch.clouds), 0, 0)
             parts.append(_columns(batch, scenes, robots))

@@ -75,7 +75,7 @@ class ProgramScorer:
         reach_m = np.maximum(robot.arm_reach_m, _MIN_REACH_M)
         shared = tokens | {"camera_rise_m": camera_rise_m, "reach_m": reach_m, "poses": poses}
         rho = _visible_share(of_cloud, tokens, candidates, float(camera_rise_m[0]))
-        codes = hand_reach(poses, robot, candidates, tokens["rise_m"])
+        codes = hand_reach(poses, cloud, robot, candidates, tokens["rise_m"])
         logits: list[F32] = []
         for start in range(0, len(rows), AT_ONCE):
             some = np.minimum(np.arange(start, start + AT_ONCE), len(rows) - 1)

@@ -26,7 +26,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from datagen.train.hands.poses import poses_of_clouds
-from datagen.train.hands.reach import N_STAGES, hand_reach, hands_of
+from datagen.train.hands.reach import N_CODES, hand_reach, hands_of
 from datagen.train.inputs import CandidateInputs, Clouds, RobotInputs
 from datagen.train.models.crop import crop_clouds, take_rows
 from datagen.train.models.frames import (
@@ -106,7 +106,7 @@ def with_reach(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     Its codes of reach are multiplied with 0. Weights that have codes already stay as they are.
     """
     name = "hands.seen.weight"
-    missing = N_SEEN_FROM_MOUNT + N_STAGES - weights[name].shape[1]
+    missing = N_SEEN_FROM_MOUNT + N_CODES - weights[name].shape[1]
     return {**weights, name: torch.nn.functional.pad(weights[name], (0, missing))}
 
 
@@ -155,7 +155,7 @@ class SharedModel(Model):
         self.scalars = nn.Sequential(nn.Linear(n_scalars, 64), nn.ReLU(), nn.Linear(64, embedding))
         joined = 2 * embedding
         if self.sizes.hand_poses:
-            self.hands = HandPooling(n_scalars, width, N_STAGES * self.sizes.kinematics)
+            self.hands = HandPooling(n_scalars, width, N_CODES * self.sizes.kinematics)
             joined += 3 * width
         self.head = nn.Sequential(
             nn.LayerNorm(joined),
@@ -233,7 +233,7 @@ class SharedModel(Model):
         if tokens.hand_poses is not None and self.sizes.hand_poses:
             cloud_row = robots.cloud_row[candidates.robot_row]
             some = torch.arange(len(candidates), device=scalars.device).split(size)
-            reach = self.hand_reach(tokens, candidates, robots)
+            reach = self.hand_reach(tokens, clouds, candidates, robots)
             codes = [None] * len(some) if reach is None else reach.split(size)
             of_tiles = [
                 self.hands(tokens.hand_poses, cloud_row[rows], take_rows(frames, rows), scalars[rows], of)
@@ -260,9 +260,13 @@ class SharedModel(Model):
         return torch.from_numpy(rho.astype(np.float32)).to(candidates.base_xy_m.device)
 
     def hand_reach(
-        self, tokens: Tokens, candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
+        self,
+        tokens: Tokens,
+        clouds: Clouds[Tensor],
+        candidates: CandidateInputs[Tensor],
+        robots: RobotInputs[Tensor],
     ) -> Tensor | None:
-        """Codes (N, K, N_STAGES) of the hand poses, on the CPU; those of `EncodedCandidates` as they are.
+        """Codes (N, K, N_CODES) of the hand poses, on the CPU; those of `EncodedCandidates` as they are.
 
         None without `kinematics`. Raises InputError where a robot's files are missing.
         """
@@ -271,7 +275,7 @@ class SharedModel(Model):
         if isinstance(candidates, EncodedCandidates):
             return candidates.reach
         poses, rise_m = (t.cpu().numpy() for t in (tokens.hand_poses, tokens.target_rise_m))
-        codes = hand_reach(poses, on_cpu(robots), on_cpu(candidates), rise_m)
+        codes = hand_reach(poses, on_cpu(clouds), on_cpu(robots), on_cpu(candidates), rise_m)
         return torch.from_numpy(codes).to(candidates.base_xy_m.device)
 
     def _frames(

@@ -203,7 +203,7 @@ class EncodedCandidates(CandidateInputs[A]):
     """N base positions with the estimated visibility of the target."""
 
     visible_share: A  # (N,) float32
-    reach: A | None = field(default=None, kw_only=True)  # (N, K, N_STAGES) uint8 of `hand_reach`
+    reach: A | None = field(default=None, kw_only=True)  # (N, K, N_CODES) uint8 of `hand_reach`
 
 
 def pack(tokens: Tokens) -> tuple[Tensor, Tensor]:

@@ -73,13 +73,16 @@ def pose_reach(name: str, reach_m: float) -> PoseReach:
 def known_arm(name: str) -> Mapping[str, npt.NDArray[Any]]:
     """`hand` (8,), `reach_m` (L,), `size` (L, 7) at each and `code` (C,) of a registered robot; {} of others.
 
+    Fields `tree.*` and `radius_m` are those of `link_spheres`.
+
     The name may have the digest of its files, as in a specification: other files are another robot.
     """
     plain, _, digest = name.partition("@")
     with np.load(str(KNOWN_ARMS), allow_pickle=False) as stored:
         if f"{plain}/digest" not in stored or digest not in ("", str(stored[f"{plain}/digest"])):
             return {}
-        return {field: stored[f"{plain}/{field}"] for field in ("hand", "reach_m", "size", "code")}
+        own = f"{plain}/"
+        return {field.removeprefix(own): stored[field] for field in stored.files if field.startswith(own)}
 
 
 def reach_codes(arm: PoseReach, axes: F64, pose_row: Ints, base_xy_m: F64, turn_rad: F64, rise_m: F64) -> U8:

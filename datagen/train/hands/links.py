@@ -1,0 +1,127 @@
+"""How much room the arm's links have in the observed cloud, where its hand is at a pose.
+
+For each pose the joint vector of a cell near it stands for the arm; its spheres are moved so that the wrist
+is where the pose wants it, the further along the arm the more. A planner finds other joint vectors, and sees
+what the cloud does not: the model learns what the room is worth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from datagen.train.hands.poses import DistanceGrid
+from datagen.train.inputs import F64, I64, U8, Array, Bools, Clouds
+from datagen.workers.motion.arm_links import ArmLinks, cells_at, to_front
+from datagen.workers.motion.pose_reach import WAY_M, PoseReach
+from datagen.workers.motion.reach_cells import DISTANCES, HEIGHTS, cells_of
+
+N_ROOMS = 2  # codes of a pose: at the grasp, and above it
+_POSES = 16  # of a candidate: the best that its arm can reach
+_MOST_ROOM_M, _BEYOND_M = 0.08, 0.2
+_CELL_M, _AROUND_M = 0.025, np.array([1.0, 1.0, 0.8])
+_AT_ONCE = 256  # bases in one pass: bounds memory
+
+
+def obstacles(clouds: Clouds[Array]) -> list[DistanceGrid]:
+    """Distances to the observed points of each cloud (S,) but for its target's."""
+    shape = tuple(np.rint(2 * _AROUND_M / _CELL_M).astype(int).tolist())
+    return [
+        DistanceGrid(points_m[:n][~mask[:n]], -_AROUND_M, shape, _CELL_M)
+        for points_m, mask, n in zip(clouds.points_m, clouds.target_mask, clouds.n_points, strict=True)
+    ]
+
+
+def room_codes(
+    arm: PoseReach,
+    links: ArmLinks,
+    around: Sequence[DistanceGrid],
+    axes: F64,
+    reach: U8,
+    pose_row: I64,
+    base_xy_m: F64,
+    turn_rad: F64,
+    rise_m: F64,
+) -> U8:
+    """Codes (N, K, N_ROOMS) of K poses from each of N bases: 1 to 255 for -8 to 8 cm, 0 where unknown.
+
+    `around` (S,) has each cloud's obstacles and `reach` (N, K, N_STAGES) the poses' codes of reach; others
+    as in `reach_codes`.
+    """
+    found = np.zeros((*reach.shape[:2], N_ROOMS), np.uint8)
+    able = reach.min(axis=2) > 0
+    able &= np.cumsum(able, axis=1) <= _POSES
+    for start in range(0, len(pose_row), _AT_ONCE):
+        n, k = np.nonzero(able[start : start + _AT_ONCE])
+        n += start
+        hands = np.moveaxis(axes[pose_row[n], k], 0, 2)  # (3 of TCP, approach and closing axis, 3, Q)
+        given = (pose_row[n], base_xy_m[n], turn_rad[n], rise_m[n])
+        found[n, k] = _rooms(arm, links, around, hands, *given)
+    return found
+
+
+def _rooms(
+    arm: PoseReach,
+    links: ArmLinks,
+    around: Sequence[DistanceGrid],
+    hands: F64,
+    cloud: I64,
+    base_xy_m: F64,
+    turn_rad: F64,
+    rise_m: F64,
+) -> U8:
+    yaw = np.arctan2(-base_xy_m[:, 1], -base_xy_m[:, 0]) + turn_rad
+    mount = np.stack([*base_xy_m.T, -rise_m])
+    tcp, a, b = to_front(yaw, hands[0] - mount), to_front(yaw, hands[1]), to_front(yaw, hands[2])
+    tcp[:2] -= arm.axis_xy_m[:, None]
+    across = np.cross(b, a, axis=0)
+    scale, found = arm.half_m / links.half_m, np.zeros((len(cloud), N_ROOMS), np.uint8)
+    u, v, w = arm.tcp_wrist_m
+    for stage, up_m in enumerate((0.0, WAY_M)):
+        for roll in (1.0, -1.0):
+            at = tcp + roll * u * across + roll * v * b + w * a
+            at[2] += up_m
+            planar, azimuth = np.hypot(at[0], at[1]), np.arctan2(at[1], at[0])
+            direction = cells_of(
+                to_front(azimuth, a), to_front(azimuth, roll * b), None if arm.turns else azimuth
+            )
+            some, row = _chosen(arm, links, planar, at[2], azimuth, direction)
+            p = np.moveaxis(links.center_m[row].astype(np.float64) * scale, 2, 0)  # (3, Q', B)
+            away_m = np.stack([planar[some], at[2, some]], axis=1) - links.wrist_m[row] * scale
+            p[[0, 2]] += away_m.T[:, :, None] * links.along
+            p = to_front(-azimuth[some, None], p)
+            p[:2] += arm.axis_xy_m[:, None, None]
+            p = np.moveaxis(to_front(-yaw[some, None], p) + mount[:, some, None], 0, 2)
+            distance_m = np.empty(p.shape[:2], np.float32)
+            for each in np.unique(cloud[some]):
+                of = cloud[some] == each
+                distance_m[of] = around[each](p[of], _BEYOND_M)
+            room = (distance_m - links.radius_m * scale).min(axis=1)
+            code = 1 + np.rint((room / _MOST_ROOM_M + 1).clip(0, 2) * 127).astype(np.uint8)
+            found[some, stage] = np.maximum(found[some, stage], code)
+    return found
+
+
+def _chosen(
+    arm: PoseReach, links: ArmLinks, planar_m: F64, height_m: F64, azimuth: F64, direction: I64
+) -> tuple[I64, I64]:
+    """Rows of those wrists (Q,) near which there is a joint vector within its limits, and of these vectors.
+
+    The wrist's own cell is asked first, then the nearest ones in distance, in height and in both.
+    """
+    step_m = np.array([1 / DISTANCES, 2 / HEIGHTS]) * arm.half_m
+    own = np.stack([planar_m, height_m + arm.half_m]) / step_m[:, None]
+    side = np.where(own % 1 > 0.5, 1, -1) * step_m[:, None]
+    found = np.full(len(planar_m), -1)
+    low, high = links.turn_limits_rad
+    for more, up in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        cell = cells_at(arm, planar_m + more * side[0], height_m + up * side[1], direction)
+        row = np.searchsorted(links.cell, cell).clip(max=len(links.cell) - 1)
+        fits: Bools = links.cell[row] == cell
+        if np.isfinite(low):
+            turn = links.turn_rad[row] + azimuth
+            fits &= turn - 2 * np.pi * np.floor((turn - low) / (2 * np.pi)) <= high
+        found = np.where((found < 0) & fits, row, found)
+    some = np.flatnonzero(found >= 0)
+    return some, found[some]
