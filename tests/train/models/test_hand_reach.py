@@ -19,6 +19,7 @@ from datagen.train.models.shared import SharedModel, with_reach
 from datagen.train.tensors import on_cpu
 from datagen.train.training.checkpoints import read_checkpoint
 from datagen.train.training.training_setup import prepare_training
+from datagen.workers.motion.pose_reach import N_STAGES
 from tests.sim_extra import needs_robots, needs_sim
 from tests.train.models.made_batches import SMALL, Tables, drawn_tables, small_model, turned_about_z
 from tests.train.models.test_hand_poses import box, table
@@ -123,18 +124,19 @@ def test_the_arm_the_hand_and_the_heading_change_logits(model: Model) -> None:
 @needs_sim
 @pytest.mark.parametrize("angle", [0.3, -2.0, 4.0])
 def test_codes_turn_with_the_scene_and_a_far_base_has_none(angle: float) -> None:
-    _, candidates, robots = tables = drawn_tables(7, candidates=60)
-    _, elsewhere, _ = turned_about_z(tables, angle)
+    clouds, candidates, robots = tables = drawn_tables(7, candidates=60)
+    turned_clouds, elsewhere, _ = turned_about_z(tables, angle)
     poses = np.stack([hand_poses(table(), box(seen), 64) for seen in (0.4, 1.5)])
     c, s = np.cos(angle), np.sin(angle)
     turned = poses.copy()
     axes = turned[..., HAND_WIDTH - 9 :].reshape(2, 64, 3, 3)
     axes[...] = axes @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
     rise = np.array([0.1, 0.2, 0.3], np.float32)
-    codes = hand_reach(poses, on_cpu(robots), on_cpu(candidates), rise).astype(float)
-    after = hand_reach(turned, on_cpu(robots), on_cpu(elsewhere), rise)
+    codes = hand_reach(poses, on_cpu(clouds), on_cpu(robots), on_cpu(candidates), rise)[..., :N_STAGES]
+    codes = codes.astype(float)
+    after = hand_reach(turned, on_cpu(turned_clouds), on_cpu(robots), on_cpu(elsewhere), rise)[..., :N_STAGES]
     assert 0.2 < (codes > 0).mean() < 1 and np.ptp(codes) > 50
     # A pose at the border of two cells may fall into the other one.
     assert (np.abs(after - codes) > 1).mean() < 0.01
     far = replace(candidates, base_xy_m=candidates.base_xy_m + 5.0)
-    assert not hand_reach(poses, on_cpu(robots), on_cpu(far), rise).any()
+    assert not hand_reach(poses, on_cpu(clouds), on_cpu(robots), on_cpu(far), rise).any()

@@ -7,7 +7,8 @@ import pytest
 
 from datagen.train.hands.sizes import measured_hand
 from datagen.workers.motion import pose_reach as module
-from datagen.workers.motion.measured_reach import measured_arm, reaches_of, size_row
+from datagen.workers.motion.arm_links import RADIUS, TREE
+from datagen.workers.motion.measured_reach import link_spheres, measured_arm, reaches_of, size_row
 from datagen.workers.motion.pose_reach import known_arm, pose_reach, reach_codes
 from datagen.workers.motion.reach_cells import cells_of
 from datagen.workers.motion.reach_map import cell_of
@@ -75,6 +76,10 @@ def test_the_shipped_hands_and_maps_are_those_of_the_robots_files(name: str) -> 
         arm = measured_arm(name, float(reaches_m[step]))
         np.testing.assert_allclose(known["size"][step], size_row(arm), atol=1e-6)
         assert (known["code"] != arm.code).mean() < 1e-3
+    tree, radius_m = link_spheres(name)
+    np.testing.assert_allclose(known[RADIUS], radius_m, atol=1e-6)
+    for field, values in tree._asdict().items():
+        np.testing.assert_allclose(known[TREE + field], values, atol=1e-6)
 
 
 @needs_sim
