@@ -98,6 +98,7 @@ def main() -> None:
             said = [good[name, _MAPPED][-1] for name in (names[0], names[-1])]
             own, nearest = ("none" if each is None else "good" if each else "bad" for each in said)
             file = options.pictures / f"scene{k}-{own}-nearest-{nearest}.png"
+            file.parent.mkdir(parents=True, exist_ok=True)
             with file.open("wb") as drawn:
                 draw_prediction(answers[names[0], _MAPPED], drawn)
     print(f"{asked - refused} scenes, percent of them; {refused} more frames are refused. 95% by scene.\n")
