@@ -68,7 +68,7 @@ def _shaded_pixels(
     rows = np.flatnonzero(faces_light > 0)
     eye_m = camera.T_world_camera[:3, 3].astype(np.float32)
     points_m = eye_m + depth_m[rows, None] * rays[rows] + _OFF_SURFACE_M * normals[rows]
-    rows = rows[~_in_shadow(scene, points_m, to_light)]
+    rows = rows[~_in_shadow(scene, np.asarray(points_m, np.float32), to_light)]
     light = _AMBIENT + fill
     light[rows] += _LIGHT * faces_light[rows]
     rgb = np.minimum(colour * light[:, None], 255).astype(np.uint8)
@@ -91,12 +91,10 @@ def _in_shadow(scene: RayScene, points_m: F32, to_light: F32) -> npt.NDArray[np.
     towards = np.tile(to_light, (len(points_m), 1))
     limits = np.maximum((_LIGHT_M - points_m[:, 2]) / to_light[2], 0)
     dark = occluded(scene.house, points_m, towards, limits)
-    # Objects lie together: few points can be in the shadow of any.
-    centre_m = scene.T_world_object[:, :3, 3].mean(0)
-    radius_m = float(
-        (np.linalg.norm(scene.T_world_object[:, :3, 3] - centre_m, axis=1) + scene.radii_m).max()
-    )
-    near = _below_sphere(points_m, to_light, centre_m, radius_m)
+    # Objects lie around the target: few points can be in the shadow of any.
+    centres_m = scene.T_world_object[:, :3, 3]
+    radius_m = float((np.linalg.norm(centres_m - centres_m[0], axis=1) + scene.radii_m).max())
+    near = _below_sphere(points_m, to_light, centres_m[0], radius_m)
     for rays, T, radius_m in zip(scene.objects, scene.T_world_object, scene.radii_m, strict=True):
         rows = near[_below_sphere(points_m[near], to_light, T[:3, 3], radius_m)]
         dark[rows] |= occluded(rays, *into_frame(T, points_m[rows], towards[rows]), limits[rows])
