@@ -6,6 +6,7 @@ Geometry, and so depth and bodies, are those of `embree.py`; stored clouds keep 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -14,10 +15,12 @@ from datagen.workers.geometry.mesh import F32, F64, U8
 from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.houses.house import Room
 from datagen.workers.rendering import I16, Camera, Frame
+from datagen.workers.rendering.cloud import target_pixels
 from datagen.workers.rendering.embree import (
     Hits,
     RayMesh,
     RayScene,
+    Values,
     cast_surfaces,
     into_frame,
     occluded,
@@ -32,7 +35,8 @@ _HORIZON, _ZENITH = np.array([[222, 232, 241], [104, 158, 222]], np.float32)
 _AMBIENT, _FILL, _LIGHT = 0.58, (0.04, 0.06, 0.10), 0.50
 _LIGHT_M = 2.2  # only things below this height cast shadows: walls are higher, and would darken whole rooms
 _OFF_SURFACE_M = 1e-3
-_IN_CACHE = 16_384  # pixels; all at once take 1.5 times as long
+_IN_CACHE = 16_384  # pixels
+_MARGIN = 1.3  # of the sphere around all objects, which a picture shows larger off its middle
 # Range of the light's direction: degrees above the horizon, and to a side of straight behind the camera.
 _ELEVATION_DEG, _ASIDE_DEG = (45.0, 75.0), (20.0, 70.0)
 
@@ -52,17 +56,29 @@ def render_shaded(scene: RayScene, rooms: Sequence[Room], camera: Camera, to_lig
     body, as little as the sky, and cast no shadow.
     """
     h, w = camera.height_px, camera.width_px
-    blocks = np.split(np.arange(h * w), range(_IN_CACHE, h * w, _IN_CACHE))
-    parts = zip(*(_shaded_pixels(scene, rooms, camera, to_light, pixels) for pixels in blocks), strict=True)
-    rgb, depth_m, body = map(np.concatenate, parts)
+    centres_m = scene.T_world_object[:, :3, 3]
+    radius_m = float((np.linalg.norm(centres_m - centres_m[0], axis=1) + scene.radii_m).max())
+    near = np.zeros(h * w, np.bool_)
+    near[target_pixels(camera, centres_m[0], _MARGIN * radius_m)] = True
+    rgb, depth_m = np.empty((h * w, 3), np.uint8), np.empty(h * w, np.float32)
+    body, bare = np.empty(h * w, np.int16), replace(scene, objects=())
+    for visible, pixels in (scene, np.flatnonzero(near)), (bare, np.flatnonzero(~near)):
+        for k in range(0, len(pixels), _IN_CACHE):
+            block = pixels[k : k + _IN_CACHE]
+            surfaces = cast_surfaces(visible, camera, block, _surface, np.zeros(6, np.float32))
+            rgb[block] = _lit(scene, rooms, camera, to_light, surfaces)
+            depth_m[block], body[block] = surfaces[1:3]
     return Frame(camera, rgb.reshape(h, w, 3), depth_m.reshape(h, w), body.reshape(h, w))
 
 
-def _shaded_pixels(
-    scene: RayScene, rooms: Sequence[Room], camera: Camera, to_light: F32, pixels: I64
-) -> tuple[U8, F32, I16]:
-    nothing = np.zeros(6, np.float32)
-    values, depth_m, body, rays = cast_surfaces(scene, camera, pixels, _surface, nothing)
+def _lit(
+    scene: RayScene,
+    rooms: Sequence[Room],
+    camera: Camera,
+    to_light: F32,
+    surfaces: tuple[Values, F32, I16, F32],
+) -> U8:
+    values, depth_m, body, rays = surfaces
     colour, normals = values[:, :3], values[:, 3:]
     faces_light, fill = (normals @ np.column_stack([to_light, np.array(_FILL, np.float32)])).T
     rows = np.flatnonzero(faces_light > 0)
@@ -74,7 +90,7 @@ def _shaded_pixels(
     rgb = np.minimum(colour * light[:, None], 255).astype(np.uint8)
     empty = np.flatnonzero(body < 0)
     rgb[empty] = _outside(eye_m, rays[empty], rooms, float(scene.house.mesh.vertices_m[:, 2].max()))
-    return rgb, depth_m, body
+    return rgb
 
 
 def _surface(rays: RayMesh, hits: Hits, directions: F32, R_world_mesh: F32 | None) -> F32:
