@@ -28,7 +28,7 @@ class ExportOptions(AssetSources):
     """Options of `export`.
 
     Args:
-        to: Format: glb, huggingface, lerobot, parquet, rerun or webdataset.
+        to: Format: frames, glb, huggingface, lerobot, parquet, rerun or webdataset.
         out: Folder or s3:// address of the export, new or of an interrupted one.
         scenes: Scenes to export: one index, or FIRST:PAST. [default: all]
     """
@@ -44,11 +44,11 @@ class ExportOptions(AssetSources):
 @prints(print_export)
 @options_of(ExportOptions)
 def export(given: ExportOptions) -> dict[str, Any]:
-    """Export a run for another program: tables, data sets, recordings or a mesh.
+    """Export a run for another program: tables, data sets, pictures, recordings or a mesh.
 
     After an interruption, run the same command again: finished files are kept. Equal runs give equal bytes.
-    `datagen verify OUT` checks the files, and that the run has not changed since. The formats lerobot, rerun
-    and glb rebuild scenes, from the houses and objects of the run.
+    `datagen verify OUT` checks the files, and that the run has not changed since. The formats frames,
+    lerobot, rerun and glb rebuild scenes, from the houses and objects of the run.
 
     For example: datagen export runs/first --to parquet --out export
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 # A format is a function from an ExportSource to the steps that make its files, in order.
 FORMATS: dict[str, str] = {
+    "frames": "datagen.exports.frames:steps",
     "glb": "datagen.exports.glb:steps",
     "huggingface": "datagen.exports.huggingface:steps",
     "lerobot": "datagen.exports.lerobot:steps",

@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -20,13 +20,15 @@ from rerun.chunk import Chunk, ChunkStore
 
 from datagen.drawing.posed_robot import robot_bodies
 from datagen.drawing.scene_picture import best_success
-from datagen.drawing.trial_picture import Retrial, try_again
 from datagen.exports.export_run import ExportSource, NewFile, Step, scene_key
 from datagen.exports.glb import LABEL_RGB, arrows
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.run import Run
 from datagen.workers.geometry.mesh import F64, Mesh, concatenate
 from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_candidates
+
+if TYPE_CHECKING:
+    from datagen.drawing.trial_picture import Retrial
 
 _POINT_M, _BASE_M = 0.005, 0.04
 # Of a file of Rerun: bytes before the first message, and kinds of messages.
@@ -35,17 +37,25 @@ _HEADER_BYTES, _END, _STORE = 12, 0, 1
 
 def steps(source: ExportSource) -> Sequence[Step]:
     """A recording for each scene."""
+    return source.each_scene(lambda run, rows: [recording(source, run, rows)])
 
-    def file(run: Run, rows: SceneRows) -> Iterator[NewFile]:
-        scene = source.rebuilt(run, rows.record)
-        key = scene_key(run.manifest.spec_hash, scene.index)
-        chunks = [_identified(chunk, f"{key} {k}") for k, chunk in enumerate(_chunks(run, rows, scene))]
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "scene.rrd"
-            ChunkStore.from_chunks(chunks).write_rrd(str(path), application_id="datagen", recording_id=key)
-            yield NewFile(f"{key}.rrd", _repeatable(path.read_bytes()))
 
-    return source.each_scene(file)
+def recording(source: ExportSource, run: Run, rows: SceneRows) -> NewFile:
+    """The recording of a scene. InputError without its houses and objects."""
+    scene = source.rebuilt(run, rows.record)
+    key = scene_key(run.manifest.spec_hash, scene.index)
+    chunks = [_identified(chunk, f"{key} {k}") for k, chunk in enumerate(_chunks(run, rows, scene))]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.rrd"
+        ChunkStore.from_chunks(chunks).write_rrd(str(path), application_id="datagen", recording_id=key)
+        return NewFile(f"{key}.rrd", _repeatable(path.read_bytes()))
+
+
+def joined(recordings: Sequence[bytes]) -> bytes:
+    """One file of recordings as `recording` makes them: their messages, with one header and one end."""
+    end = struct.pack("<QQ", _END, 0)
+    messages = (data[_HEADER_BYTES:].removesuffix(end) for data in recordings)
+    return b"".join([recordings[0][:_HEADER_BYTES], *messages, end])
 
 
 def _chunks(run: Run, rows: SceneRows, scene: ReconstructedScene) -> Iterator[Chunk]:
@@ -79,6 +89,8 @@ def _best_trial(run: Run, rows: SceneRows, scene: ReconstructedScene) -> Retrial
     row = best_success(rows.samples) if "attempts" in rows.samples else None
     if row is None:
         return None
+    from datagen.drawing.trial_picture import try_again  # needs the extra sim
+
     return try_again(scene, reconstruct_candidates(rows.samples, scene), row, run.manifest.spec)
 
 

@@ -44,14 +44,14 @@ def _members(schema: RecordSchema, rows: SceneRows) -> Iterator[tuple[str, bytes
         yield name, data.getvalue()
     fields = [f for f in schema.scene_fields if f.name not in _CLOUD.values()]
     document = {
-        **_plain(fields, rows.record),
-        "candidates": _plain(schema.sample_fields, rows.samples)
+        **plain(fields, rows.record),
+        "candidates": plain(schema.sample_fields, rows.samples)
         | {"sample_id": [row.tobytes().hex() for row in rows.samples["sample_id"]]},
     }
     yield "json", json.dumps(document).encode()
 
 
-def _plain(fields: Sequence[Field], values: Mapping[str, Any]) -> dict[str, Any]:
+def plain(fields: Sequence[Field], values: Mapping[str, Any]) -> dict[str, Any]:
     """Numbers and (nested) lists; texts for codes."""
     found = ((f, np.asarray(values[f.name])) for f in fields)
     coded = ((f.name, np.asarray(np.array(f.codes, object)[v] if f.codes else v)) for f, v in found)

@@ -22,6 +22,7 @@ class Stream(IntEnum):
     PATH = 5
     DISTURBANCE = 6
     PLACE = 10
+    LIGHT = 11  # for no sample: in exported frames
     ARRIVAL = 9  # for no sample: poses at which robots arrive in a closed loop
 
 

@@ -76,7 +76,7 @@ EXTRAS: dict[str, Extra] = {
         "open_dataset and candidates: xarray and pandas", {"pandas": "pandas", "xarray": "xarray"}
     ),
     "export": Extra("export to parquet and huggingface", {"pyarrow": "pyarrow"}),
-    "rerun": Extra("export to rerun", {"pyarrow": "pyarrow", "rerun": "rerun-sdk"}),
+    "rerun": Extra("export to rerun, view", {"pyarrow": "pyarrow", "rerun": "rerun-sdk"}),
     "pybullet": Extra("a second settler", {"pybullet": "pybullet"}),
 }
 

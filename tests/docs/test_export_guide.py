@@ -26,6 +26,7 @@ FORMATS = {
     "Hugging Face": "huggingface",
     "WebDataset": "webdataset",
     "LeRobot": "lerobot",
+    "Frames": "frames",
     "Rerun": "rerun",
     "GLB": "glb",
     "A format of your own": "counted:steps",

@@ -6,11 +6,11 @@ scans are used undecimated. Pixels are cast one by one, so that a sample of a fr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -19,7 +19,7 @@ import numpy.typing as npt
 from datagen.workers.geometry.mesh import F32, F64, I32, U8, Mesh, concatenate, face_normals
 from datagen.workers.houses.house import House
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.rendering import Camera, Frame, Pixels, SceneGeometry, pixel_directions
+from datagen.workers.rendering import I16, Camera, Frame, Pixels, SceneGeometry, pixel_directions
 
 if TYPE_CHECKING:
     from embreex.rtcore_scene import EmbreeScene
@@ -132,6 +132,10 @@ def into_frame(T_world_body: F64, origins_m: F32, directions: F32) -> tuple[F32,
     return np.ascontiguousarray(local, np.float32), np.ascontiguousarray(directions @ R, np.float32)
 
 
+# Values (N, C) of hits: rays (N, 3) are in the frame of the mesh, whose rotation is None in the world frame.
+Values = npt.NDArray[Any]
+Surface = Callable[[RayMesh, Hits, F32, F32 | None], Values]
+
 _BACKGROUND_RGB = (225, 232, 240)
 _AMBIENT, _LAMP, _HEAD = 0.50, 0.35, 0.30
 _LAMP_DIRECTION = np.array([0.35, 0.25, 0.90], np.float32) / np.float32(np.sqrt(0.35**2 + 0.25**2 + 0.9**2))
@@ -161,6 +165,16 @@ def render_rays(scene: RayScene, camera: Camera) -> Frame:
 
 def cast_pixels(scene: RayScene, camera: Camera, pixels: npt.NDArray[np.int64]) -> Pixels:
     """Colour, depth and body of chosen pixels, given as flat indices (N,) into the frame."""
+    return Pixels(*cast_surfaces(scene, camera, pixels, _shade, np.array(_BACKGROUND_RGB, np.uint8))[:3])
+
+
+def cast_surfaces(
+    scene: RayScene, camera: Camera, pixels: npt.NDArray[np.int64], surface: Surface, nothing: Values
+) -> tuple[Values, F32, I16, F32]:
+    """Values (N, C) of chosen pixels' surfaces, their depth (N,) and body (N,), and the rays (N, 3), world.
+
+    `surface` gives the values of hits; those of pixels without one are `nothing` (C,).
+    """
     n = len(pixels)
     rotation = camera.T_world_camera[:3, :3].astype(np.float32)
     directions = np.ascontiguousarray(pixel_directions(camera, pixels) @ rotation.T)
@@ -170,10 +184,9 @@ def cast_pixels(scene: RayScene, camera: Camera, pixels: npt.NDArray[np.int64]) 
     hits = first_hits(scene.house, origins, directions)
     depth_m = hits.parameter.copy()
     body = np.where(hits.face >= 0, 0, -1).astype(np.int16)
-    rgb = np.empty((n, 3), np.uint8)
-    rgb[:] = _BACKGROUND_RGB
+    values = np.tile(nothing, (n, 1))
     shown = hits.face >= 0
-    rgb[shown] = _shade(scene.house, _take(hits, shown), directions[shown])
+    values[shown] = surface(scene.house, _take(hits, shown), directions[shown], None)
 
     eye_m = camera.T_world_camera[:3, 3]
     for k, rays in enumerate(scene.objects):
@@ -184,9 +197,10 @@ def cast_pixels(scene: RayScene, camera: Camera, pixels: npt.NDArray[np.int64]) 
         closer = found.parameter < depth_m[near]
         rows = near[closer]
         depth_m[rows], body[rows] = found.parameter[closer], k + 1
-        rgb[rows] = _shade(rays, _take(found, closer), local_directions[closer], T[:3, :3].astype(np.float32))
+        R = T[:3, :3].astype(np.float32)
+        values[rows] = surface(rays, _take(found, closer), local_directions[closer], R)
     depth_m[depth_m >= MISS] = 0.0
-    return Pixels(rgb, depth_m, body)
+    return values, depth_m, body, directions
 
 
 def _take(hits: Hits, rows: npt.NDArray[np.bool_]) -> Hits:
@@ -202,12 +216,12 @@ def _towards_sphere(eye_m: F64, directions: F32, centre_m: F64, radius_m: float)
     return np.flatnonzero((gap2 < (radius_m * 1.01 + 1e-3) ** 2) & (along > -radius_m))
 
 
-def _shade(rays: RayMesh, hits: Hits, directions: F32, R_world_mesh: F32 | None = None) -> U8:
+def _shade(rays: RayMesh, hits: Hits, directions: F32, R_world_mesh: F32 | None) -> U8:
     """Surface colour times ambient light, a lamp from above and a light at the camera; (N, 3).
 
     `directions` are in the mesh's frame; two-sided, because scans have holes.
     """
-    colour = _surface_colour(rays, hits).astype(np.float32)
+    colour = surface_colour(rays, hits).astype(np.float32)
     normals = rays.normals[hits.face]
     facing = np.einsum("ij,ij->i", normals, directions)
     facing /= np.sqrt(np.einsum("ij,ij->i", directions, directions))
@@ -218,7 +232,8 @@ def _shade(rays: RayMesh, hits: Hits, directions: F32, R_world_mesh: F32 | None 
     return np.minimum(colour * light[:, None], 255.0).astype(np.uint8)
 
 
-def _surface_colour(rays: RayMesh, hits: Hits) -> U8:
+def surface_colour(rays: RayMesh, hits: Hits) -> U8:
+    """Colours (N, 3) of hits without light: of the texture, or of the face."""
     texture = rays.mesh.texture
     if texture is None:
         return rays.mesh.face_rgb[hits.face]

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ import pytest
 import trimesh
 import webdataset
 import yaml
+from PIL import Image
 
 import datagen
 from datagen import cli
@@ -27,10 +29,12 @@ from datagen.exports import FORMATS
 from datagen.schemas.fields import OUTCOMES, RETRY_OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_scene
+from datagen.train.prediction.frames import read_place
 from datagen.workers.houses import split_of
 from tests.conftest import once
+from tests.refusals import refused
 from tests.sim_extra import needs_sim
-from tests.small_runs import PER_SCENE, arrays_of, make_small_run
+from tests.small_runs import CONFIG, PER_SCENE, arrays_of, make_small_run
 from tests.train.conftest import sim_run
 
 __all__ = ["sim_run"]
@@ -160,6 +164,66 @@ def test_glb_has_the_house_the_objects_and_the_candidates(run: Path, tmp_path: P
     ahead = (corners[:, 0] - corners.mean(axis=1))[:, :2] / 0.12
     np.testing.assert_allclose(ahead, np.stack([np.cos(yaw), np.sin(yaw)], axis=1), atol=1e-4)
     assert scene.metadata["license"].startswith("built-in houses")
+
+
+@pytest.mark.parametrize("noisy", [False, True], ids=["exact", "noisy"])
+def test_frames_have_the_stored_points_in_a_folder_that_predict_reads(
+    noisy: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    noise = f"\n[observation.noise]\nenabled = {str(noisy).lower()}\n"
+    config = CONFIG.replace("160", "320").replace("120", "240").replace("154", "308") + noise
+    run = make_small_run(tmp_path / "run", 3 * PER_SCENE, config=config)
+    out = export(run, "frames", tmp_path / "out", "--scenes", "1:3")
+    lines = [json.loads(line) for line in (out / "frames.jsonl").read_text().splitlines()]
+    assert [line["scene_index"] for line in lines] == [1, 2] and cli.run(["verify", str(out)]) == 0
+    for line in lines:
+        folder, record = out / line["frame"], read_scene(Run.open(run), line["scene_index"]).record
+        _assert_stored_points(folder, line, record)
+        capsys.readouterr()
+        robot = ["--base-height", "0.7", "--reach", "0.9"]
+        assert cli.run(["predict", "--frame", str(folder), *robot, "--json"]) in (0, 1)
+        answer = json.loads(capsys.readouterr().out)
+        np.testing.assert_allclose(answer["target"]["center_m"], record["target_center_m"], atol=0.06)
+
+
+def _assert_stored_points(folder: Path, line: dict[str, Any], record: Mapping[str, Any]) -> None:
+    """Each stored point is a pixel's, at its centre by K, and has its depth; masks and colours fit."""
+    names = ("color", "depth", "mask", "objects")
+    color, depth, mask, objects = (np.array(Image.open(folder / f"{name}.png")) for name in names)
+    assert depth.dtype == np.uint16 and color.shape == (*depth.shape, 3) and color.std() > 10
+    n, T, K = int(record["n_points"]), np.array(line["T_world_camera"]), np.array(line["K"])
+    world = record["points_m"][:n].astype(np.float64) + record["target_center_m"]
+    camera = (world - T[:3, 3]) @ T[:3, :3]
+    u, v = (camera @ K.T)[:, :2].T / camera[:, 2]
+    column, row = np.rint([u, v]).astype(int)
+    assert max(np.abs(u - column).max(), np.abs(v - row).max()) < 0.3
+    # Half a millimetre of depth.png, and as much of float16 up to 1 m from the target.
+    assert np.abs(depth[row, column] / 1000 - camera[:, 2]).max() < 1e-3
+    assert (mask[row, column] == 255 * record["target_mask"][:n]).all()
+    assert ((objects == 1) == (mask == 255)).all() and line["object_name"][0] == record["object_name"][0]
+    read = read_place(folder)
+    assert read.image is not None and read.T_world_camera is not None
+    np.testing.assert_allclose(read.T_world_camera, record["T_world_camera"], atol=1e-12)
+    back = read.image.points(row * depth.shape[1] + column) @ T[:3, :3].T + T[:3, 3]
+    assert np.linalg.norm(back - world, axis=1).max() < 2e-3
+
+
+def test_frames_of_real_houses_show_each_object_and_light_changes_no_depth(
+    assets: Path, real_objects: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = ("--houses", f"procthor:{assets / 'procthor'}", "--objects", real_objects)
+    config = "[scene]\nplaces = {shelf = 1, inside = 1}\n"
+    run = make_small_run(tmp_path / "run", 2 * PER_SCENE, *real, config=CONFIG + config)
+    lines = (export(run, "frames", tmp_path / "out") / "frames.jsonl").read_text().splitlines()
+    for line in map(json.loads, lines):
+        folder, record = (
+            tmp_path / "out" / line["frame"],
+            read_scene(Run.open(run), line["scene_index"]).record,
+        )
+        assert line["place"] in ("shelf", "inside") and line["split"] == split_of(str(record["house_id"]))
+        _assert_stored_points(folder, line, record)
+    gone = ["export", str(run), "--to", "frames", "--out", str(tmp_path / "new"), "--houses", "procthor:gone"]
+    refused(gone, capsys, "gone", "no such folder of houses")
 
 
 def entities(file: Path) -> dict[str, list[Any]]:

@@ -1,0 +1,44 @@
+"""`datagen view`: the scenes that filters choose, in one file for Rerun."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from datagen import cli
+from datagen.schemas.run import Run
+from datagen.schemas.shard_reading import read_scene
+from tests.refusals import refused
+
+
+@pytest.mark.skipif(find_spec("rerun") is not None, reason="Rerun is installed")
+def test_without_rerun_one_line_names_the_extra(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refused(["view", str(finished)], capsys, "rerun", "is not installed", "Install the extra rerun")
+
+
+@pytest.mark.skipif(find_spec("rerun") is None, reason="the extra `rerun` is not installed: 500 MB")
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_the_chosen_scenes_are_in_one_file(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from rerun.chunk import RrdReader
+
+    names = [str(read_scene(Run.open(finished), k).record["object_name"][0]) for k in range(3)]
+    out, words = tmp_path / "scenes.rrd", ["view", str(finished), "--out", str(tmp_path / "scenes.rrd")]
+    for more, wanted in (
+        ([], [0, 1, 2]),
+        (["--place", "top"], [0, 1, 2]),
+        (["--object", names[1][2:]], [k for k in range(3) if names[k] == names[1]]),
+        (["--scene", "2"], [2]),
+    ):
+        capsys.readouterr()
+        assert cli.run([*words, *more]) == 0
+        assert [int(line.split()[0]) for line in capsys.readouterr().out.splitlines()[1:]] == wanted
+        clouds = [c for c in RrdReader(str(out)).stream() if c.entity_path == "/cloud"]
+        assert len(clouds) == len(wanted)
+    refused([*words, "--place", "roof"], capsys, "--place: roof", "Choose one of: floor, inside")
+    refused([*words, "--outcome", "success"], capsys, "--outcome: success", "the run has none")
+    refused([*words, "--object", "piano"], capsys, "no scene has all of these", "Give fewer filters")
+    refused([*words[:-1], str(tmp_path / "scenes.png")], capsys, "is not a .rrd file")
