@@ -11,11 +11,10 @@ import numpy as np
 
 from datagen.cluster.attempt import ends_job
 from datagen.cluster.attempt_guard import Meter, this_host
-from datagen.cluster.code_digest import code_digest
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.job_monitor import JobProgress
-from datagen.cluster.protocol import AttemptResult, JobSummary, StopRequest, stop_on_signals
+from datagen.cluster.protocol import AttemptResult, JobSummary, StopRequest, code_digest, stop_on_signals
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.configuration.specify import manifest_of

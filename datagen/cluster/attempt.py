@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 
 from datagen.cluster.attempt_guard import Meter, this_host
-from datagen.cluster.code_digest import code_digest
-from datagen.cluster.preflight import refuse_other_code, refuse_unfit_machine
-from datagen.cluster.protocol import AttemptResult, JobCannotContinue, ShardTask, UnfitMachine
+from datagen.cluster.protocol import AttemptResult, JobCannotContinue, ShardTask, UnfitMachine, code_digest
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import commit_key, utc_now
 from datagen.schemas.run import Run, RunReplaced
@@ -17,6 +16,7 @@ from datagen.schemas.run_records import Commit
 from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.shard_reading import read_scenes
 from datagen.schemas.storage.errors import FORBIDDEN, FULL, StoreUnavailable, machine_error
+from datagen.workers.engine_versions import refuse_other_engines
 from datagen.workers.robots import gripper_of
 from datagen.workers.run_shard import run_shard
 from datagen.workers.world import World, open_world
@@ -116,3 +116,32 @@ def _open_scenes_run(path: str, scenes_hash: str) -> Run:
         fix = "Give --scenes-from with the run that this one was started with"
         raise InputError(path, "spec_hash", "the run now has other scenes", fix)
     return scenes_run
+
+
+_SAME_CODE = "Install the same version of datagen on every machine"
+_SHARED = "Put the run and its sources on a path that every machine has, or on s3://"
+
+
+@contextmanager
+def probe_in(run: Run) -> Generator[str]:
+    """Give the name of a new file in the run, by which machines recognize it; removed after the block."""
+    probe = f".probe-{secrets.token_hex(8)}"
+    run.storage.put_new(probe, b"driver")
+    try:
+        yield probe
+    finally:
+        with suppress(InputError):
+            run.storage.delete([probe])
+
+
+def refuse_other_code(driver: str) -> None:
+    """Raise InputError where this machine's code has another digest than the driver's."""
+    if code_digest() != driver:
+        raise InputError("datagen", "", "the code here differs from that of the job's driver", _SAME_CODE)
+
+
+def refuse_unfit_machine(run: Run, probe: str) -> None:
+    """Raise InputError where `run` is another folder than the driver's, or the engines here are others."""
+    if probe and not run.storage.exists(probe):
+        raise InputError(run.storage.url, "", "is another folder here than on the driver's machine", _SHARED)
+    refuse_other_engines(f"{run.storage.url}/manifest.json", run.manifest.spec)

@@ -25,8 +25,7 @@ from datagen.workers.objects.model import ObjectModel, ObjectSource
 from datagen.workers.objects.object_files import TABLE, ObjectFiles, find_objects
 from datagen.workers.objects.object_reading import GIVEN, Given, read_object
 from datagen.workers.objects.scan import CACHE, model_of, restored_scan, stored_scan
-from datagen.workers.objects.ycb import YcbObjects
-from datagen.workers.objects.ycb_layouts import INDEXES
+from datagen.workers.objects.ycb import INDEXES, YcbObjects
 from datagen.workers.source_statement import read_statement
 
 # Part of every digest: raise it when the same files are read differently.

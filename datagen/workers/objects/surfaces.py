@@ -17,9 +17,14 @@ from datagen.schemas.safe_files import read_regular
 from datagen.workers.extras import how_to_get
 from datagen.workers.geometry.mesh import F64, U8, Mesh, Texture
 from datagen.workers.houses.glb import DAMAGE, MAX_FACES, read_pieces
-from datagen.workers.objects.materials import Material, read_materials
 from datagen.workers.objects.obj_file import read_obj
-from datagen.workers.objects.texture import face_colours, read_texture, reduced_image
+from datagen.workers.objects.texture import (
+    Material,
+    face_colours,
+    read_materials,
+    read_texture,
+    reduced_image,
+)
 
 I64 = npt.NDArray[np.int64]
 
