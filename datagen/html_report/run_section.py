@@ -14,8 +14,7 @@ from datagen.display.html_page import escape, html_facts, html_figure, html_fold
 from datagen.display.styles import OUTCOME_STYLES
 from datagen.html_report.figures import FLOOR_CAPTION, draw_floor
 from datagen.html_report.run_columns import RunColumns, read_columns
-from datagen.reports.audit import audit_runs
-from datagen.reports.audit_text import cost_rows
+from datagen.reports.audit import audit_runs, cost_rows
 from datagen.reports.run_status import status_report
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run

@@ -17,9 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
-from datagen.schemas.safe_files import read_regular
+from datagen.schemas.safe_files import is_inside, read_regular
 from datagen.workers.json_document import parse_json
-from datagen.workers.objects.model import ObjectModel
+from datagen.workers.objects.model import LoadedOnce, ObjectModel
 from datagen.workers.objects.obj_file import read_obj_header
 from datagen.workers.objects.scan import (
     READER_VERSION,
@@ -34,7 +34,7 @@ from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG, reason_to_excl
 from datagen.workers.source_statement import read_statement
 
 
-class YcbObjects:
+class YcbObjects(LoadedOnce):
     """The usable objects of one folder (see `ycb_layouts` for the layouts).
 
     Opening it hashes every object and reads each content once, so that damaged or implausible data
@@ -68,28 +68,15 @@ class YcbObjects:
                 "has no usable object: all were excluded",
                 f"First reason: {next(iter(excluded.values()))}",
             )
-        self.digest = digest_of({name: _digest(e, mass_kg) for name, (e, mass_kg) in self._entries.items()})
+        self._digests = {
+            name: digest_of([entry.files.digest, float(mass_kg).hex(), READER_VERSION])
+            for name, (entry, mass_kg) in self._entries.items()
+        }
+        self.digest = digest_of(self._digests)
 
-    def names(self) -> list[str]:
-        """Usable objects, sorted."""
-        return list(self._entries)
-
-    def load(self, name: str) -> ObjectModel:
-        """The model; the same object at every call. Raises InputError for an unknown name."""
-        model = self._models.get(name)
-        if model is None:
-            if name not in self._entries:
-                reason = self.excluded.get(name, "there is no such object")
-                raise InputError("ycb objects", name, reason, "See `names()` for those that can be used")
-            entry, mass_kg = self._entries[name]
-            model = self._models[name] = model_of(
-                name, _digest(entry, mass_kg), mass_kg, load_scan(entry.files)
-            )
-        return model
-
-
-def _digest(entry: Entry, mass_kg: float) -> str:
-    return digest_of([entry.files.digest, float(mass_kg).hex(), READER_VERSION])
+    def _model(self, name: str) -> ObjectModel:
+        entry, mass_kg = self._entries[name]
+        return model_of(name, self._digests[name], mass_kg, load_scan(entry.files))
 
 
 def open_ycb(folder: str) -> YcbObjects:
@@ -219,12 +206,7 @@ def _validated(index: Path, adapter: TypeAdapter[Any]) -> Any:
 
 def _inside(folder: Path, place: Path, field: str, relative: str) -> Path:
     """`folder / relative`. Raises InputError if it leaves the folder, also through a link."""
-    try:
-        path = (folder / relative).resolve()
-        inside = path.is_relative_to(folder.resolve()) and "\0" not in relative
-    except (OSError, ValueError, RuntimeError):
-        inside = False
-    if not inside or not relative:
+    if not relative or "\0" in relative or not is_inside(folder, folder / relative):
         raise InputError(
             place,
             field,
