@@ -47,6 +47,9 @@ class Layout(StoredRecord):
     scenes_per_shard: int = Field(ge=1, le=100_000)
     candidates_per_scene: int = Field(ge=1, le=1_000_000)
 
+    def __hash__(self) -> int:
+        return hash((self.scenes_per_shard, self.candidates_per_scene))
+
     @property
     def samples_per_shard(self) -> int:
         return self.scenes_per_shard * self.candidates_per_scene

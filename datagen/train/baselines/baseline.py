@@ -104,7 +104,7 @@ def best_cut(score: F64, label: Bools) -> float:
     return float(s[0]) if k == 0 else float((s[k - 1] + s[k]) / 2)
 
 
-def refitted_cut(baseline: Baseline, batches: Sequence[Batch[Array]], threshold: float) -> float:
+def refitted_cut(baseline: Scorer, batches: Sequence[Batch[Array]], threshold: float) -> float:
     """The best cut on scores of 0 or more; `threshold` where all of these have the same label.
 
     InputError where all labels are equal.
