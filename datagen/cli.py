@@ -24,10 +24,10 @@ from cyclopts.exceptions import (
 )
 
 from datagen import __version__
-from datagen.cluster.environment import ENDING_RAY, job_environment
+from datagen.cluster.ray_settings import ENDING_RAY, job_environment
 from datagen.console.command_lines import PRINTER, Interrupted, begin_with_process
 from datagen.console.printing import drop_output
-from datagen.display.observers import LossyStream
+from datagen.display.progress import LossyStream
 from datagen.schemas.errors import InputError, one_line, refuse_not_utf8
 from datagen.workers.extras import missing_library
 from datagen.workers.registry import allow

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from datagen.cluster.attempt import ends_job
-from datagen.cluster.attempt_guard import Meter, this_host
-from datagen.cluster.code_digest import code_digest
+from datagen.cluster.attempt import commit_rows, ends_job
+from datagen.cluster.attempt_guard import Meter
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.job_monitor import JobProgress
@@ -23,9 +22,8 @@ from datagen.configuration.stored_scenes import StoredScenes, specify_again
 from datagen.display.progress import Progress
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import sample_ids
-from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Commit, StageClock
+from datagen.schemas.run_records import StageClock
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_files import encode_array, group_metadata, zipped
 from datagen.schemas.shard_ranges import ShardRanges
@@ -169,29 +167,11 @@ def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips:
     with clock.stage("visibility"):
         made = _relabelled(run, stored)
         files = {path: kept.get(path) for path in kept.paths} | _made_files(run, made)
-    with ends_job(), clock.stage("write"):
-        entry = run.write_object(task.attempt, zipped(files))
-    cost = meter.cost(clock, entry.size).model_copy(update={"source_s": before.cost.all_s})
-    positives = int(made["label"].sum())
-    commit = Commit(
-        shard=task.shard,
-        attempt=task.attempt,
-        spec_hash=run.manifest.spec_hash,
-        scenes=before.scenes,
-        samples=before.samples,
-        positives=positives,
-        redraws={},  # nothing was sampled
-        object=entry,
-        cost=cost,
-        host=this_host(),
-        code_digest=code_digest(),
-        created=utc_now(),
-    )
-    with ends_job():
-        won = run.commit(commit)
+    # Nothing was sampled, so that there are no redraws.
+    result = commit_rows(run, task, zipped(files), made["label"], clock, meter, {}, before.cost.all_s)
     flips.to_good += int((made["label"] > stored["label"]).sum())
     flips.to_bad += int((made["label"] < stored["label"]).sum())
-    return AttemptResult(won, before.samples, positives, cost)
+    return result
 
 
 def _relabelled(run: Run, stored: Columns) -> Columns:

@@ -29,8 +29,19 @@ from datagen.train.models.frames import frames_of, target_features
 from datagen.train.models.shared import SharedModel, stretched
 from datagen.train.models.tokens import Tokens, tokens_of
 from datagen.train.prediction.trained_robots import trained_robots
-from datagen.train.program_scorer import AT_ONCE, CLOUD, ENCODE, POINTS, SCORE, TO_SCORE, TOKENS
-from datagen.train.programs import MARK, OPERATIONS, Function, Step
+from datagen.train.program_scorer import (
+    AT_ONCE,
+    CLOUD,
+    ENCODE,
+    MARK,
+    OPERATIONS,
+    POINTS,
+    SCORE,
+    TO_SCORE,
+    TOKENS,
+    Function,
+    Step,
+)
 from datagen.train.scorers import weights_sha256
 from datagen.train.training.checkpoints import load_model
 

@@ -55,8 +55,7 @@ def check(source: str, /, *, picture: Path | None = None, json: AsJson = False) 
         picture: Contact sheet of the objects to write, FILE.png.
     """
     # Imported here: the other verbs of assets need no libraries of meshes.
-    from datagen.assets.check import check_source, object_rows
-    from datagen.assets.object_sheet import draw_objects
+    from datagen.assets.check import check_source, draw_objects, object_rows
 
     if picture is not None:
         refuse_output(picture, "--picture", ".png")

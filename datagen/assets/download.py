@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import http.client
 import json
@@ -183,8 +182,7 @@ def _transfer(
             if start and not _continues(answer, start):
                 part.discard()
                 start = 0
-            remaining = _content_length(answer)
-            total = None if remaining is None else start + remaining
+            total = None if answer.length is None else start + answer.length
             if max(total or 0, size or 0) > max_bytes or (None not in (size, total) and total != size):
                 part.discard()
                 wanted = f"at most {max_bytes:,}" if size is None else f"{size:,}"
@@ -214,12 +212,6 @@ def _transfer(
 def _continues(answer: Any, start: int) -> bool:
     match = _CONTENT_RANGE.fullmatch(answer.headers.get("Content-Range", ""))
     return answer.status == 206 and match is not None and int(match[1]) == start
-
-
-def _content_length(answer: Any) -> int | None:
-    with contextlib.suppress(TypeError, ValueError):
-        return max(0, int(answer.headers.get("Content-Length")))
-    return None
 
 
 def _validator(answer: Any) -> str:

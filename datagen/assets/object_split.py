@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.safe_files import read_regular, whole_file
+from datagen.schemas.safe_files import is_inside, read_regular, whole_file
 from datagen.workers.source_statement import STATEMENT
 
 Part = Literal["train", "test"]
@@ -55,19 +55,11 @@ def _read(source: Path) -> list[dict[str, Any]]:
         if not isinstance(files, dict) or not files:
             raise InputError(index, f"[{number}].files", "names no files", _FIX)
         for path in files.values():
-            if not isinstance(path, str) or not _is_inside(source, path):
+            is_known = isinstance(path, str) and ".." not in Path(path).parts
+            if not is_known or not is_inside(source, source / path) or not (source / path).is_file():
                 problem = f"{str(path)[:80]!r} is no file inside {source}"
                 raise InputError(index, f"[{number}].files", problem, _FIX)
     return entries
-
-
-def _is_inside(source: Path, path: str) -> bool:
-    """Whether a relative path leads to a file of the folder, and through no `..` or link out of it."""
-    try:
-        inside = ".." not in Path(path).parts and (source / path).resolve().is_relative_to(source)
-        return inside and (source / path).is_file()
-    except (OSError, ValueError, RuntimeError):  # a zero byte, a name too long, a loop of links
-        return False
 
 
 def _write(source: Path, folder: Path, chosen: list[dict[str, Any]]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import gzip
+import re
 import stat
 import tarfile
 import tempfile
@@ -14,11 +15,12 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any, cast
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.safe_files import DAMAGED_ZIP, open_member
+from datagen.schemas.safe_files import DAMAGED_ZIP, is_inside, open_member
 
 _CHUNK_BYTES = 2**20
 # zipfile reads its list of members at once; tarfile reads a header's extension, which may have its own.
 _ZIP_LIST = 16 * 2**20
+_NAME = re.compile(r"[^\\:\x00-\x1f]{1,1000}")
 _ADVICE = "Do not use this archive; fetch it from its publisher"
 
 
@@ -30,11 +32,7 @@ class Limits:
     files: int = 200_000
 
 
-@dataclass(frozen=True)
-class _Member:
-    name: str
-    size: int
-    stream: IO[bytes]
+_Member = tuple[str, int, IO[bytes]]  # its name, its size as stated, and its content
 
 
 def unpack(archive: Path, folder: Path, limits: Limits) -> list[PurePosixPath]:
@@ -51,33 +49,29 @@ def unpack(archive: Path, folder: Path, limits: Limits) -> list[PurePosixPath]:
         total = 0
         try:
             for member in _members(archive, limits):
-                relative = _safe_name(archive, member.name)
+                relative = _safe_name(archive, member[0])
                 # Names that differ only in case are one file on some systems.
                 if names.setdefault(str(relative).casefold(), relative) is not relative:
                     raise InputError(archive, str(relative), "is in the archive twice", _ADVICE)
                 if len(names) > limits.files:
                     raise InputError(archive, "", f"has more than {limits.files:,} files", _ADVICE)
                 total += _copy(archive, member, staging / relative, limits.total_bytes - total)
-        except InputError:
-            raise
-        except (tarfile.TarError, gzip.BadGzipFile, RecursionError, *DAMAGED_ZIP) as error:
-            raise _damaged(archive, error) from error
-        except OSError as error:
-            if error.errno != errno.EINVAL:  # an offset before the archive's start; else the disk
+        except (OSError, tarfile.TarError, RecursionError, *DAMAGED_ZIP) as error:
+            # EINVAL: an offset before the archive's start. Other numbers are of the disk.
+            of_disk = isinstance(error, OSError) and error.errno not in (None, errno.EINVAL)
+            if of_disk or isinstance(error, InputError):
                 raise
-            raise _damaged(archive, error) from error
+            fix = "Remove it from the cache and fetch it again"
+            raise InputError(archive, "", f"is damaged ({error})", fix) from error
         files = sorted(names.values())
         for relative in files:
             target = folder / relative
-            _refuse_links(archive, folder, relative)
+            if not is_inside(folder, target.parent):
+                problem = f"{target.parent} is behind a link that leads out of the folder"
+                raise InputError(archive, str(relative), problem, "Remove it or use an empty folder")
             target.parent.mkdir(parents=True, exist_ok=True)
             (staging / relative).replace(target)
     return files
-
-
-def _damaged(archive: Path, error: Exception) -> InputError:
-    fix = "Remove it from the cache and fetch it again"
-    return InputError(archive, "", f"is damaged ({error})", fix)
 
 
 def _members(archive: Path, limits: Limits) -> Iterator[_Member]:
@@ -102,7 +96,7 @@ def _members(archive: Path, limits: Limits) -> Iterator[_Member]:
                     raise InputError(archive, info.name, f"claims {info.size:,} bytes", _ADVICE)
                 stream = tar.extractfile(info)
                 assert stream is not None
-                yield _Member(info.name, info.size, stream)
+                yield info.name, info.size, stream
 
 
 def _zip_members(archive: Path, limits: Limits) -> Iterator[_Member]:
@@ -121,47 +115,29 @@ def _zip_members(archive: Path, limits: Limits) -> Iterator[_Member]:
             if info.is_dir():
                 continue
             with open_member(packed, info) as stream:
-                yield _Member(info.filename, info.file_size, stream)
+                yield info.filename, info.file_size, stream
 
 
 def _safe_name(archive: Path, name: str) -> PurePosixPath:
     path = PurePosixPath(name)
-    hostile = (
-        not name
-        or path.is_absolute()
-        or ".." in path.parts
-        or "\\" in name
-        or ":" in name
-        or any(ord(c) < 32 for c in name)
-        or len(name) > 1000
-    )
-    if hostile:
+    if not _NAME.fullmatch(name) or path.is_absolute() or ".." in path.parts:
         raise InputError(archive, repr(name[:80]), "is a path outside the folder", _ADVICE)
     return path
 
 
 def _copy(archive: Path, member: _Member, target: Path, room: int) -> int:
     """Copy at most `room` bytes, whatever size the archive claims; return their number."""
+    (name, size, stream), copied = member, 0
     target.parent.mkdir(parents=True, exist_ok=True)
-    copied = 0
     with target.open("xb") as out:
-        while chunk := member.stream.read(_CHUNK_BYTES):
+        while chunk := stream.read(_CHUNK_BYTES):
             copied += len(chunk)
             if copied > room:
-                raise InputError(archive, member.name, "unpacks to more bytes than allowed", _ADVICE)
+                raise InputError(archive, name, "unpacks to more bytes than allowed", _ADVICE)
             out.write(chunk)
-    if copied != member.size:
-        raise InputError(archive, member.name, f"has {copied:,} of {member.size:,} bytes", _ADVICE)
+    if copied != size:
+        raise InputError(archive, name, f"has {copied:,} of {size:,} bytes", _ADVICE)
     return copied
-
-
-def _refuse_links(archive: Path, folder: Path, relative: PurePosixPath) -> None:
-    """Raise InputError for an existing link in the folder that leads outside."""
-    step = folder
-    for part in relative.parts:
-        step = step / part
-        if step.is_symlink():
-            raise InputError(archive, str(relative), f"{step} is a link", "Remove it or use an empty folder")
 
 
 class _BoundedStream:

@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
+from typing import Any, Literal
+
+import numpy.typing as npt
 
 from datagen.cluster.attempt_guard import Meter, this_host
-from datagen.cluster.code_digest import code_digest
-from datagen.cluster.preflight import refuse_other_code, refuse_unfit_machine
-from datagen.cluster.protocol import AttemptResult, JobCannotContinue, ShardTask, UnfitMachine
+from datagen.cluster.protocol import (
+    AttemptResult,
+    JobCannotContinue,
+    ShardTask,
+    Task,
+    UnfitMachine,
+    code_digest,
+)
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import commit_key, utc_now
 from datagen.schemas.run import Run, RunReplaced
-from datagen.schemas.run_records import Commit
+from datagen.schemas.run_records import Commit, StageClock
 from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.shard_reading import read_scenes
 from datagen.schemas.storage.errors import FORBIDDEN, FULL, StoreUnavailable, machine_error
+from datagen.workers.engine_versions import refuse_other_engines
 from datagen.workers.robots import gripper_of
 from datagen.workers.run_shard import run_shard
 from datagen.workers.world import World, open_world
@@ -28,7 +38,6 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
     Raises JobCannotContinue where run or sources cannot be opened, or the disk is full. Other exceptions
     are not caught and concern this attempt only (see `guarded`).
     """
-    spec_hash = task.spec.hash()
     run, world, scenes_run = open_task(task)
     with ends_job():
         run.ledger.start(task.attempt, task.shard)
@@ -40,19 +49,35 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
         # A run of an older version keeps its arrays.
         scene = {field.name: made.scene[field.name] for field in run.schema.scene_fields}
         sample = {field.name: made.sample[field.name] for field in run.schema.sample_fields}
-        data = encode_shard(run.schema, run.layout, spec_hash, scene, sample)
+        data = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scene, sample)
+    return commit_rows(run, task, data, made.sample["label"], made.clock, meter, made.redraws)
+
+
+def commit_rows(
+    run: Run,
+    task: Task,
+    data: bytes,
+    labels: npt.NDArray[Any],
+    clock: StageClock,
+    meter: Meter,
+    redraws: dict[str, int],
+    source_s: dict[Literal["wall", "cpu"], float] | None = None,
+) -> AttemptResult:
+    """Write the rows of a shard, with these labels (N,), and commit them unless another attempt was first.
+
+    Raises JobCannotContinue for a full or read-only disk.
+    """
+    with ends_job(), clock.stage("write"):
         entry = run.write_object(task.attempt, data)
-    labels = made.sample["label"]
-    cost = meter.cost(made.clock, written_bytes=entry.size)
-    positives = int(labels.sum())
+    cost = meter.cost(clock, entry.size).model_copy(update={"source_s": source_s or {}})
     commit = Commit(
         shard=task.shard,
         attempt=task.attempt,
-        spec_hash=spec_hash,
-        scenes=len(task.scene_indices),
+        spec_hash=run.manifest.spec_hash,
+        scenes=run.layout.scenes_per_shard,
         samples=len(labels),
-        positives=positives,
-        redraws=made.redraws,
+        positives=int(labels.sum()),
+        redraws=redraws,
         object=entry,
         cost=cost,
         host=this_host(),
@@ -61,7 +86,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
     )
     with ends_job():
         won = run.commit(commit)
-    return AttemptResult(won, len(labels), positives, cost, commit if won else None)
+    return AttemptResult(won, len(labels), commit.positives, cost, commit if won else None)
 
 
 def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:
@@ -116,3 +141,32 @@ def _open_scenes_run(path: str, scenes_hash: str) -> Run:
         fix = "Give --scenes-from with the run that this one was started with"
         raise InputError(path, "spec_hash", "the run now has other scenes", fix)
     return scenes_run
+
+
+_SAME_CODE = "Install the same version of datagen on every machine"
+_SHARED = "Put the run and its sources on a path that every machine has, or on s3://"
+
+
+@contextmanager
+def probe_in(run: Run) -> Generator[str]:
+    """Give the name of a new file in the run, by which machines recognize it; removed after the block."""
+    probe = f".probe-{secrets.token_hex(8)}"
+    run.storage.put_new(probe, b"driver")
+    try:
+        yield probe
+    finally:
+        with suppress(InputError):
+            run.storage.delete([probe])
+
+
+def refuse_other_code(driver: str) -> None:
+    """Raise InputError where this machine's code has another digest than the driver's."""
+    if code_digest() != driver:
+        raise InputError("datagen", "", "the code here differs from that of the job's driver", _SAME_CODE)
+
+
+def refuse_unfit_machine(run: Run, probe: str) -> None:
+    """Raise InputError where `run` is another folder than the driver's, or the engines here are others."""
+    if probe and not run.storage.exists(probe):
+        raise InputError(run.storage.url, "", "is another folder here than on the driver's machine", _SHARED)
+    refuse_other_engines(f"{run.storage.url}/manifest.json", run.manifest.spec)

@@ -16,13 +16,14 @@ import resource
 import secrets
 import shutil
 import signal
+import struct
 import sys
 import tempfile
 import threading
 import time
 import traceback
 from collections.abc import Callable, Generator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cache
@@ -31,10 +32,9 @@ from typing import TypeVar
 
 import psutil
 
-from datagen.cluster.heartbeat import Running, Watch, beat_path, beating, running_here
 from datagen.cluster.protocol import AttemptReport, AttemptResult, JobCannotContinue, Task, UnfitMachine
 from datagen.schemas.record_files import utc_now
-from datagen.schemas.run_records import Cost, Host, Outcome, StageClock
+from datagen.schemas.run_records import STAGES, Cost, Host, Outcome, StageClock
 from datagen.schemas.safe_files import is_private, whole_file
 from datagen.schemas.storage.errors import (
     FULL,
@@ -301,3 +301,55 @@ def note_path(notes: str, attempt: str) -> Path:
 def stack_path(notes: str, attempt: str) -> Path:
     """The file to which `faulthandler` writes the stack of a dying worker."""
     return _folder(notes) / f"{attempt}.stack"
+
+
+# Progress within attempts, for the display: a few bytes per worker in the notes, read on the driver's machine
+# alone, since a display is not worth requests over a network.
+Watch = Callable[[str, int], None]
+_BEAT, _SUFFIX = struct.Struct("<qq"), ".beat"  # stage by its place in STAGES, and labels
+
+
+@dataclass(frozen=True)
+class Running:
+    """Sums over the attempts that run on this machine."""
+
+    labels: int = 0  # made and not committed yet
+    in_grasps: int = 0  # attempts that compute grasps, each of one object
+
+
+def beat_path(folder: Path, attempt: str) -> Path:
+    """The file of an attempt's progress."""
+    return folder / f"{attempt}{_SUFFIX}"
+
+
+@contextmanager
+def beating(path: Path) -> Generator[Watch]:
+    """Give a function that writes stage and labels to the file; the file is removed at the end.
+
+    A call is one write without a seek, about 2 µs. Errors are ignored: progress is not worth an attempt.
+    """
+    number = -1
+    with suppress(OSError):
+        number = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600)
+
+    def watch(stage: str, labels: int) -> None:
+        with suppress(OSError):
+            os.pwrite(number, _BEAT.pack(STAGES.index(stage), labels), 0)
+
+    try:
+        yield watch
+    finally:
+        with suppress(OSError):
+            os.close(number)
+            path.unlink(missing_ok=True)
+
+
+def running_here(folder: Path) -> Running:
+    """The progress of the attempts whose files are in the folder."""
+    labels = in_grasps = 0
+    for path in folder.glob(f"*{_SUFFIX}"):
+        with suppress(OSError, struct.error):  # it has ended meanwhile, or has not begun a stage
+            stage, made = _BEAT.unpack(path.read_bytes())
+            labels += made
+            in_grasps += stage == STAGES.index("grasps")
+    return Running(labels, in_grasps)

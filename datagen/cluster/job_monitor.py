@@ -10,8 +10,7 @@ import platform
 from collections.abc import Callable
 from contextlib import suppress
 
-from datagen.cluster.attempt_guard import running_attempts
-from datagen.cluster.heartbeat import Running
+from datagen.cluster.attempt_guard import Running, running_attempts
 from datagen.cluster.protocol import AttemptReport, JobSummary, JobTotals, StopRequest
 from datagen.display.progress import Pace, Progress, clock_text, whole
 from datagen.schemas.errors import InputError

@@ -8,14 +8,28 @@ from collections import Counter
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
 from threading import current_thread, main_thread
 from types import FrameType
 from typing import Literal, Protocol, TypeVar, get_args
 
-from datagen.cluster.code_digest import code_digest
+import datagen
 from datagen.schemas.run_records import Commit, Cost, Host, Layout, Outcome
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage.errors import StoreUnavailable, repeated_until
+
+
+@cache
+def code_digest() -> str:
+    """sha256 over the names and bytes of the package's Python files, computed once per process."""
+    root, whole = Path(datagen.__file__).parent, sha256()
+    for path in sorted(root.rglob("*.py")):
+        whole.update(f"{path.relative_to(root)}\0{path.stat().st_size}\0".encode())
+        whole.update(path.read_bytes())
+    return whole.hexdigest()
+
 
 T_contra = TypeVar("T_contra", contravariant=True)
 End = Literal["complete", "failed", "interrupted", "aborted"]  # each worse than the one before

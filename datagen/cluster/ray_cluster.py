@@ -19,9 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from datagen.cluster.cluster_folders import private_folder
-from datagen.cluster.environment import ENDING_RAY, changed_environment
 from datagen.cluster.ray_settings import (
+    ENDING_RAY,
     OBJECT_STORE_BYTES,
+    changed_environment,
     head_environment,
     import_root,
     new_token,

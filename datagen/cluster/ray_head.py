@@ -19,9 +19,8 @@ from pathlib import Path
 from pydantic import Field, ValidationError
 
 from datagen.cluster.cluster_folders import RAY, new_folder, remove_folder, write_private
-from datagen.cluster.environment import is_of_the_shell
 from datagen.cluster.ray_jobs import dashboard_status
-from datagen.cluster.ray_settings import head_arguments, head_environment, new_token
+from datagen.cluster.ray_settings import head_arguments, head_environment, is_of_the_shell, new_token
 from datagen.schemas.errors import InputError
 from datagen.schemas.run_records import StoredRecord
 from datagen.schemas.safe_files import is_private

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
-from datagen.cluster.environment import JOB_ENVIRONMENT, changed_environment
 from datagen.cluster.ray_cluster import first_line, known_token
+from datagen.cluster.ray_settings import JOB_ENVIRONMENT, changed_environment
 from datagen.schemas.errors import InputError
 
 _FIX = "Give the cluster's dashboard, http://HOST:8265, and its token as RAY_AUTH_TOKEN where it requires one"
@@ -37,7 +37,7 @@ class RayJobs:
         """
         runtime: dict[str, Any] = {"env_vars": dict(environment)}
         if JOB_ENVIRONMENT in environment:
-            runtime["worker_process_setup_hook"] = "datagen.cluster.environment.adopt_job_environment"
+            runtime["worker_process_setup_hook"] = "datagen.cluster.ray_settings.adopt_job_environment"
         until_s = time.monotonic() + _AGENT_WITHIN_S
         with self._refusing("", "See the cluster's dashboard"):
             while True:

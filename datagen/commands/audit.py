@@ -8,8 +8,7 @@ from cyclopts import Parameter
 
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json
-from datagen.reports.audit import audit_runs
-from datagen.reports.audit_text import print_audit
+from datagen.reports.audit import audit_runs, print_audit
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import open_runs
 

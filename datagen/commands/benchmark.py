@@ -99,8 +99,7 @@ def pack(
         scenes: Scenes of all runs together, of which each has an equal share.
         without_labels: Keep the labels back; `score` refuses such a pack.
     """
-    from datagen.evaluation.benchmark import present_runs, read_benchmark, refuse_differing
-    from datagen.evaluation.benchmark_pack import write_pack
+    from datagen.evaluation.benchmark import present_runs, read_benchmark, refuse_differing, write_pack
 
     definition = read_benchmark(None if "://" in str(runs) else Path(runs))
     paths = present_runs(str(runs), definition)

@@ -17,7 +17,6 @@ from datagen.evaluation.report_tables import with_interval
 from datagen.schemas.errors import InputError, one_line, printable
 from datagen.schemas.run import open_runs
 from datagen.schemas.specification import HeuristicParams, Specification
-from datagen.train.bootstrap import Estimate
 from datagen.train.heuristic_fit import (
     FOLDS,
     FORMS,
@@ -186,14 +185,10 @@ def _agreements(trials: Trials, labels: dict[str, Any]) -> dict[str, Any]:
     """Metrics of the rules' labels, by rule, and the gain from before to after."""
     found = dict(zip(labels, agreements(trials, list(labels.values())), strict=True))
     gain = [after.minus(before) for before, after in zip(found["before"], found["after"], strict=True)]
-
-    def record(estimate: Estimate) -> dict[str, float | None]:
-        low, high = estimate.interval()
-        numbers = {"value": estimate.value, "low": low, "high": high}
-        return {name: number if number == number else None for name, number in numbers.items()}  # nan
-
-    columns = {**found, "gain": gain}
-    return {name: dict(zip(_METRICS, map(record, column), strict=True)) for name, column in columns.items()}
+    return {
+        name: {metric: each.values() for metric, each in zip(_METRICS, column, strict=True)}
+        for name, column in {**found, "gain": gain}.items()
+    }
 
 
 def _toml(report: dict[str, Any]) -> str:

@@ -12,7 +12,7 @@ from datagen.console.command_lines import absolute_path, command_line, prints, r
 from datagen.console.options import AsJson, PathOrAddress
 from datagen.console.printing import print_json, print_rows, seconds, summary_of_stored
 from datagen.display.progress import steps
-from datagen.reports.spending import account_for
+from datagen.reports.audit import account_for
 from datagen.schemas.merging import MergePlan, MergeResult, WrittenPart, merge_runs, plan_merge
 from datagen.schemas.run import Run, label_counts, open_runs
 

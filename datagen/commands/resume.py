@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from heapq import heapify, heapreplace
 from pathlib import Path
 from typing import Annotated
 
@@ -128,11 +127,7 @@ def shares(have: Sequence[int], per_shard: Sequence[int], n: int) -> list[int]:
     step = missing // len(have) - max(per_shard)
     given = [max(0, step // size) * size for size in per_shard]
     missing -= sum(given)
-    heap = [(labels, k) for k, labels in enumerate(given)]
-    heapify(heap)
-    while missing >= per_shard[heap[0][1]]:
-        labels, k = heap[0]
-        missing, given[k] = missing - per_shard[k], labels + per_shard[k]
-        heapreplace(heap, (given[k], k))
+    while missing >= per_shard[k := given.index(min(given))]:
+        missing, given[k] = missing - per_shard[k], given[k] + per_shard[k]
     given[-1] += missing
     return [a + b for a, b in zip(have, given, strict=True)]

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from datagen import __version__
-from datagen.cluster.code_digest import code_digest
+from datagen.cluster.protocol import code_digest
 from datagen.configuration.robot_fields import (
     Fields,
     complete_arm,

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import itertools
 import json
+import select
 import sys
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
-from typing import TextIO, cast
+from typing import Any, TextIO, cast
 
 from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn
@@ -21,7 +22,6 @@ from rich.progress import Progress as Bar
 from rich.table import Column
 from rich.text import Text
 
-from datagen.display.observers import LossyStream
 from datagen.schemas.errors import printable
 
 _RATE_OVER_S, _LINE_EVERY_S, _DRAW_EVERY_S = 60.0, 10.0, 0.2
@@ -191,3 +191,37 @@ def clock_text(seconds: float | None) -> str:
     if (left_s := whole(seconds)) is None:
         return "-:--:--"
     return f"{left_s // 3600}:{left_s // 60 % 60:02d}:{left_s % 60:02d}"
+
+
+class LossyStream:
+    """A text stream that drops text for a closed pipe, a full disk or a lost terminal.
+
+    With `waits` false it also drops text for a reader that does not keep up, where a write would block.
+    """
+
+    def __init__(self, stream: TextIO, waits: bool = True) -> None:
+        self._stream, self._poll = stream, None if waits else _poll_of(stream)
+
+    def write(self, text: str) -> int:
+        with suppress(OSError, ValueError):  # ValueError: the stream is closed
+            if self._poll is None or self._poll.poll(0):
+                self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError, ValueError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _poll_of(stream: TextIO) -> select.poll | None:
+    """Whether the stream can be written now; None for one without a descriptor, as of a notebook."""
+    try:
+        number = stream.fileno()
+    except (OSError, ValueError, AttributeError):
+        return None
+    poll = select.poll()
+    poll.register(number, select.POLLOUT)
+    return poll

@@ -60,7 +60,6 @@ _CAMERA_OUTLINE = (
 CAMERA = Style("#111111", _CAMERA_OUTLINE, "camera", "#ffffff")
 BEST = Style("#ffc400", "*", "best success")
 BEST_BY_SCORE = Style("#ffffff", "P", "highest score where the base fits")
-SAMPLE = Style("#ffc400", "*", "this sample")
 TARGET = Style("#ff2d6f", "", "target", "#ffffff")
 CLUTTER = Style("#c9d2db", "", "other objects", "#4a5560")
 MARK_STYLES = {"camera": CAMERA, "best": BEST, "best by score": BEST_BY_SCORE}

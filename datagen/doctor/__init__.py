@@ -7,6 +7,8 @@ import os
 import platform
 import resource
 import shutil
+import signal
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -23,7 +25,6 @@ from rich.text import Text
 
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, size
-from datagen.doctor import engines
 from datagen.workers.content_cache import cache_folder
 from datagen.workers.extras import EXTRAS, how_to_get
 from datagen.workers.robots import ROBOTS, robot_source
@@ -91,26 +92,24 @@ def checks() -> Iterator[Check]:
         yield Check(library, partial(_load, library), f"apt-get install -y {package}")
     for name in EXTRAS:
         yield Check(f"extra {name}", partial(_extra, name), how_to_get(name), "ok")
-    settlers = {"sapien": engines.SAPIEN_PHYSICS, "pybullet": engines.PYBULLET}
+    settlers = {"sapien": SAPIEN_PHYSICS, "pybullet": PYBULLET}
     if installed := [name for name in settlers if find_spec(name)]:
         fix = f"Install the libraries named above, or: {_AGAIN} {' '.join(installed)}"
         yield Check("settlers", partial(_any_of, {name: settlers[name] for name in installed}), fix, "fail")
     if find_spec("embreex"):
-        yield Check("embree", partial(_probe, engines.EMBREE), f"{_AGAIN} embreex", "fail")
+        yield Check("embree", partial(_probe, EMBREE), f"{_AGAIN} embreex", "fail")
     if find_spec("ray"):
-        yield Check("ray", partial(_probe, engines.RAY), f"{_AGAIN} ray; or use --workers 0.")
+        yield Check("ray", partial(_probe, RAY), f"{_AGAIN} ray; or use --workers 0.")
     if not EXTRAS["sim"].missing():
         again = f"{_AGAIN} numba coal mani-skill"
-        yield Check(
-            "arm libraries", partial(_probe, engines.LIBRARIES), f"Plan and sim labels need them. {again}"
-        )
+        yield Check("arm libraries", partial(_probe, LIBRARIES), f"Plan and sim labels need them. {again}")
         for name in ROBOTS:
             from_sim = robot_source(name).keys.urdf.startswith("package:mani_skill/")
             if from_sim or not EXTRAS["robots"].missing():  # the line of the extra says that it is missing
-                code = engines.ROBOT.format(name=name)
+                code = ROBOT.format(name=name)
                 yield Check(f"robot {name}", partial(_probe, code), f"Use another --robot, or: {again}")
         fix = "See the settlers and robots above; plan labels need no physics."
-        yield Check("grasp trial", partial(_probe, engines.TRIAL), fix)
+        yield Check("grasp trial", partial(_probe, TRIAL), fix)
 
 
 def found(check: Check) -> Finding:
@@ -188,7 +187,7 @@ def _extra(name: str) -> str:
 
 
 def _probe(code: str) -> str:
-    answer = engines.probe(code)
+    answer = probe(code)
     if not answer.succeeded:
         raise Problem(answer.text)
     return answer.text
@@ -196,7 +195,7 @@ def _probe(code: str) -> str:
 
 def _any_of(codes: dict[str, str]) -> str:
     """One working settler is enough: a broken one beside it is a warning."""
-    answers = {name: engines.probe(code) for name, code in codes.items()}
+    answers = {name: probe(code) for name, code in codes.items()}
     text = "; ".join(a.text if a.succeeded else f"{name}: {a.text}" for name, a in answers.items())
     if not all(answer.succeeded for answer in answers.values()):
         raise Problem(text, "warn" if any(answer.succeeded for answer in answers.values()) else "fail")
@@ -234,3 +233,99 @@ def doctor(*, json: AsJson = False) -> int:
         verdict = "labels can be made here" if not failures else "labels cannot be made here yet"
         console.print(f"\n{verdict}: {failures} failed, {warnings} warned")
     return 1 if failures else 0
+
+
+SAPIEN_PHYSICS = """
+import importlib, importlib.metadata
+sapien = importlib.import_module("sapien")
+scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
+builder = scene.create_actor_builder()
+builder.add_box_collision(half_size=[0.05, 0.05, 0.05])
+builder.initial_pose = sapien.Pose([0, 0, 1])
+actor = builder.build(name="cube")
+scene.step()
+assert actor.pose.p[2] < 1.0, "the cube does not fall"
+print("sapien " + importlib.metadata.version("sapien") + ", a cube falls")
+"""
+
+PYBULLET = """
+import importlib, importlib.metadata
+p = importlib.import_module("pybullet")
+p.connect(p.DIRECT)
+p.setGravity(0, 0, -9.81)
+shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.05, 0.05, 0.05])
+body = p.createMultiBody(1.0, shape, basePosition=[0, 0, 1])
+p.stepSimulation()
+assert p.getBasePositionAndOrientation(body)[0][2] < 1.0, "the cube does not fall"
+print("pybullet " + importlib.metadata.version("pybullet") + ", a cube falls")
+"""
+
+EMBREE = """
+import importlib.metadata
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+scene = EmbreeScene()
+TriangleMesh(scene, np.array([[[-1, -1, 0], [1, -1, 0], [0, 1, 0]]], np.float32))
+origin = np.array([[0, 0, 1]], np.float32)
+hit = scene.run(origin, np.array([[0, 0, -1]], np.float32))
+miss = scene.run(origin, np.array([[0, 0, 1]], np.float32))
+assert hit[0] == 0 and miss[0] == -1, "a ray cast has a wrong result"
+print("embreex " + importlib.metadata.version("embreex") + ", a ray hits")
+"""
+
+RAY = """
+import importlib
+ray = importlib.import_module("ray")
+print("ray " + ray.__version__)
+"""
+LIBRARIES = """
+import importlib, importlib.metadata, importlib.util
+numba = importlib.import_module("numba")
+coal = importlib.import_module("coal")
+assert numba.njit(lambda a, b: a + b)(1.0, 2.0) == 3.0, "machine code adds wrongly"
+near, far = coal.Transform3s(), coal.Transform3s()
+far.setTranslation(importlib.import_module("numpy").array([3.0, 0.0, 0.0]))
+ball = coal.Sphere(1.0)
+hits = lambda other: coal.collide(ball, near, ball, other, coal.CollisionRequest(), coal.CollisionResult())
+assert hits(near) and not hits(far), "the collision check of two balls is wrong"
+print("numba " + numba.__version__ + ", coal " + importlib.metadata.version("coal"))
+"""
+ROBOT = """
+from datagen.workers.robots import open_robot, robot_limits
+limits = robot_limits({name!r})
+robot = open_robot({name!r}, limits.reach_m[1], (limits.base_height_m or (0.5,))[0])
+home = robot.homes_rad[0]
+assert not robot.collides_itself(home), "the first tucked pose touches itself"
+hand = robot.gripper
+print(f"{{len(home)}} joints, reach {{robot.reach_m:.3f}} m, hand opens {{hand.max_opening_m:.3f}} m")
+"""
+TRIAL = """
+from datagen.doctor.lift import main
+raise SystemExit(main())
+"""
+# Several times the usual duration: files may be read for the first time, and the cores may be busy.
+_DEADLINE_S = 120.0
+
+
+@dataclass(frozen=True)
+class Probe:
+    """The result of a probe: its last line of output, or why there is none."""
+
+    succeeded: bool
+    text: str
+
+
+def probe(code: str, timeout_s: float = _DEADLINE_S) -> Probe:
+    """Run Python code in a new interpreter."""
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", timeout=timeout_s, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return Probe(False, f"no result within {timeout_s:.0f} s")
+    if done.returncode < 0:
+        return Probe(False, f"crashed with {signal.Signals(-done.returncode).name}")
+    said = (done.stderr if done.returncode else done.stdout).strip().splitlines()
+    return Probe(done.returncode == 0, said[-1][:200] if said else f"exit code {done.returncode}")

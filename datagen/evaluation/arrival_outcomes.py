@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from datagen.cluster.environment import changed_environment
+from datagen.cluster.ray_settings import changed_environment
 from datagen.display.progress import counting
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import OUTCOMES

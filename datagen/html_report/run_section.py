@@ -14,8 +14,7 @@ from datagen.display.html_page import escape, html_facts, html_figure, html_fold
 from datagen.display.styles import OUTCOME_STYLES
 from datagen.html_report.figures import FLOOR_CAPTION, draw_floor
 from datagen.html_report.run_columns import RunColumns, read_columns
-from datagen.reports.audit import audit_runs
-from datagen.reports.audit_text import cost_rows
+from datagen.reports.audit import audit_runs, cost_rows
 from datagen.reports.run_status import status_report
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
@@ -29,7 +28,7 @@ _SCENES = 3
 def run_section(run: Run, name: str) -> Iterator[str]:
     """The section as HTML below its heading; `name` makes its ids unique on the page."""
     status, columns = status_report(run), read_columns(run)
-    yield from _made(run, status, columns)
+    yield from _made(status, columns)
     if columns is not None:
         yield "<h3>Labels on the floor</h3>"
         yield html_figure(svg_of(draw_floor(columns), name), FLOOR_CAPTION)
@@ -41,7 +40,7 @@ def run_section(run: Run, name: str) -> Iterator[str]:
     yield from _provenance(run)
 
 
-def _made(run: Run, status: dict[str, Any], columns: RunColumns | None) -> Iterator[str]:
+def _made(status: dict[str, Any], columns: RunColumns | None) -> Iterator[str]:
     shards = status["shards"]
     state = [
         "complete" if status["complete"] else "",

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import TypeVar
 
 from datagen.cluster.cluster_folders import write_private
-from datagen.cluster.environment import JOB_ENVIRONMENT, is_of_the_shell
 from datagen.cluster.job_monitor import JOBS_API, SUBMISSION
 from datagen.cluster.ray_head import ensure_head
 from datagen.cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
+from datagen.cluster.ray_settings import JOB_ENVIRONMENT, is_of_the_shell
 from datagen.console.command_lines import command_line
 from datagen.jobs.job import JobOptions
 from datagen.jobs.job_report import JobResult

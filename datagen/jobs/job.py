@@ -14,12 +14,11 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from datagen.cluster.attempt import run_attempt
+from datagen.cluster.attempt import probe_in, run_attempt
 from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.job_monitor import JobMonitor, JobRecorder
-from datagen.cluster.preflight import probe_in
 from datagen.cluster.protocol import (
     Executor,
     JobSummary,

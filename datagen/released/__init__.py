@@ -23,7 +23,7 @@ def released_checkpoint() -> Path:
 
 
 def released_program() -> Path:
-    """The released model as NumPy's operations (`datagen.train.programs`)."""
+    """The released model as NumPy's operations (`datagen.train.program_scorer`)."""
     return _shipped_path(PROGRAM)
 
 

@@ -85,6 +85,14 @@ def open_regular(path: Path, most_bytes: int, fix: str) -> BufferedReader:
     raise InputError(path, "", problem if stat.S_ISREG(status.st_mode) else "is not a file", fix)
 
 
+def is_inside(folder: Path, path: Path) -> bool:
+    """Whether a path leads to something in the folder, also through links."""
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):  # a zero byte, a name too long, a loop of links
+        return False
+
+
 def read_regular(path: Path, most_bytes: int, fix: str) -> bytes:
     """Return the bytes of a file. Raises InputError as `open_regular` does."""
     with open_regular(path, most_bytes, fix) as file:

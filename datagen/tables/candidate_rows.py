@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from datagen.schemas.fields import OUTCOMES, Field, Table
+from datagen.schemas.errors import InputError, choices
+from datagen.schemas.fields import OUTCOMES, SCHEMAS, Field, Table
+from datagen.schemas.run import open_runs
 from datagen.schemas.shard_reading import ShardPlace
 from datagen.schemas.specification import PLACE_KINDS
 from datagen.train.reader import JOIN_FIELDS, Columns, load_shard, native
-from datagen.train.run_parts import RunPart
+from datagen.train.run_parts import RunPart, is_sealed_store, open_sealed
 from datagen.workers.houses import split_of
 
 Array = npt.NDArray[Any]
@@ -111,3 +114,26 @@ def candidate_columns(part: RunPart, shard: ShardPlace, columns: Sequence[str]) 
     return {
         name: native(DERIVED[name][1](rows) if name in DERIVED else rows.stored(name)) for name in columns
     }
+
+
+def fields_of(paths: Sequence[str | Path], function: str) -> list[dict[str, tuple[Table, Field]]]:
+    """The arrays of each path, by name: their table and description. InputError where there is no run."""
+    if not paths:
+        raise InputError(function, "paths", "no run is given", "Give the folder of at least one run")
+    return [_fields_of(path) for path in paths]
+
+
+def _fields_of(path: str | Path) -> dict[str, tuple[Table, Field]]:
+    if is_sealed_store(path):
+        name = open_sealed(path, ("scene_index", "sample_scene_index")).schema
+    else:
+        name = open_runs(str(path))[0].schema.name
+    # Readers compute what stores of older versions lack.
+    return {field.name: (table, field) for table, field in SCHEMAS[name].fields}
+
+
+def refuse_unknown(names: Sequence[str], valid: Sequence[str], place: str) -> None:
+    """Raise InputError, with the valid names, for a name that is not one of them."""
+    for name in names:
+        if name not in valid:
+            raise InputError(place, f"columns: {name}", "is not a column of these runs", choices(valid))

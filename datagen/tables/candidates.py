@@ -14,10 +14,11 @@ from datagen.tables.candidate_rows import (
     MEANINGS,
     Array,
     candidate_columns,
+    fields_of,
     needed_arrays,
+    refuse_unknown,
     valid_columns,
 )
-from datagen.tables.stored_fields import fields_of, refuse_unknown
 from datagen.train.run_parts import RunPart, open_parts, refuse_twins
 
 

@@ -15,7 +15,7 @@ from datagen.schemas.fields import Table
 from datagen.schemas.shard_files import cf_attributes, described
 from datagen.schemas.shard_reading import ShardPlace
 from datagen.schemas.stored_arrays import StoredArray
-from datagen.tables.stored_fields import fields_of, refuse_unknown
+from datagen.tables.candidate_rows import fields_of, refuse_unknown
 from datagen.train.run_parts import RunPart, open_parts, refuse_twins
 
 _Shard = tuple[ShardPlace, StoredArray]

@@ -13,11 +13,11 @@ from datagen.schemas.fields import OLDEST_SCHEMA, SCHEMA_VERSION, SCHEMAS
 from datagen.schemas.record_files import MERGED
 from datagen.schemas.run import Rows, Run, open_runs
 from datagen.schemas.run_records import MAX_FILE_BYTES, Layout
+from datagen.schemas.sealing import ZIPPED
 from datagen.schemas.shard_reading import ShardPlace, StoreFiles, StoreZip, ZipFiles, committed_place
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
 from datagen.schemas.stored_arrays import MAX_META_BYTES, StoredArray, arrays_of, readable, sources_of
-from datagen.schemas.zipped_stores import ZIPPED
 from datagen.workers.motion.pose_reach import known_arm
 from datagen.workers.robots import remember
 

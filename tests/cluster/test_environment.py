@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from datagen.cluster.environment import changed_environment
+from datagen.cluster.ray_settings import changed_environment
 
 NAMES = [f"DATAGEN_TEST_{k}" for k in range(4)]
 environments = st.dictionaries(st.sampled_from(NAMES), st.sampled_from(["", "1", "two"]))

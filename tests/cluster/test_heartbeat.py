@@ -9,8 +9,14 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from datagen.cluster.attempt_guard import Meter, collect_post_mortem, guarded, running_attempts
-from datagen.cluster.heartbeat import beat_path, beating
+from datagen.cluster.attempt_guard import (
+    Meter,
+    beat_path,
+    beating,
+    collect_post_mortem,
+    guarded,
+    running_attempts,
+)
 from datagen.cluster.job_monitor import JobProgress
 from datagen.cluster.protocol import AttemptResult, JobTotals
 from datagen.display.progress import Progress

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from datagen.cluster.attempt_guard import Running
 from datagen.cluster.driver import drive
-from datagen.cluster.heartbeat import Running
 from datagen.cluster.job_monitor import JobMonitor, JobProgress, JobRecorder
 from datagen.cluster.protocol import AttemptReport, JobSummary, JobTotals, StopRequest
 from datagen.cluster.shard_policy import RetryPolicy

@@ -9,9 +9,8 @@ from typing import Any
 
 import pytest
 
-from datagen.cluster.attempt import open_task
+from datagen.cluster.attempt import open_task, probe_in
 from datagen.cluster.attempt_guard import Meter, guarded
-from datagen.cluster.preflight import probe_in
 from datagen.cluster.protocol import AttemptResult, ShardTask, UnfitMachine
 from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+import datagen.doctor as engines
 from datagen import cli, doctor
-from datagen.doctor import Check, Finding, engines, found
-from datagen.doctor.engines import probe
+from datagen.doctor import Check, Finding, found, probe
 from datagen.workers.extras import EXTRAS, how_to_get
 from datagen.workers.robots import ROBOTS
 from tests.sim_extra import named_robots

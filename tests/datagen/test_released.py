@@ -22,7 +22,7 @@ from datagen import cli, released
 from datagen.evaluation.benchmark import read_benchmark
 from datagen.evaluation.methods import open_models
 from datagen.schemas.specification import PLACE_KINDS
-from datagen.train.programs import read_program
+from datagen.train.program_scorer import read_program
 from datagen.train.scorers import weights_sha256
 from datagen.train.training.checkpoints import load_model, read_checkpoint
 from datagen.workers.robots import robot_limits

@@ -20,7 +20,7 @@ from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.protocol import AttemptResult, StopRequest
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.shard_policy import OpenShards, RetryPolicy
-from datagen.reports.spending import account_for
+from datagen.reports.audit import account_for
 from datagen.schemas.record_files import commit_key
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, StageClock

@@ -16,7 +16,7 @@ from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import ray_executor
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.shard_policy import RetryPolicy
-from datagen.reports.spending import account_for
+from datagen.reports.audit import account_for
 from datagen.schemas.run import Run
 from tests.cluster.simulated import Heard
 from tests.faults.counted import SAMPLES_PER_SHARD, check_rows

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from datagen.reports.spending import Spending, account_for
+from datagen.reports.audit import Spending, account_for
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS

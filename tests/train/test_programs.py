@@ -17,8 +17,7 @@ from datagen.evaluation.benchmark import present_runs, read_benchmark, shipped_p
 from datagen.evaluation.runs import stream_of
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array, Batch
-from datagen.train.program_scorer import ProgramScorer
-from datagen.train.programs import read_program
+from datagen.train.program_scorer import ProgramScorer, read_program
 from datagen.train.scorers import ModelScorer
 from datagen.train.training.checkpoints import load_model
 

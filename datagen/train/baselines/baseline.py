@@ -104,6 +104,18 @@ def best_cut(score: F64, label: Bools) -> float:
     return float(s[0]) if k == 0 else float((s[k - 1] + s[k]) / 2)
 
 
+def refitted_cut(baseline: Scorer, batches: Sequence[Batch[Array]], threshold: float) -> float:
+    """The best cut on scores of 0 or more; `threshold` where all of these have the same label.
+
+    InputError where all labels are equal.
+    """
+    label = labels(batches, baseline.name)
+    score = np.concatenate([scored(baseline, b) for b in batches])
+    kept = score >= 0
+    same = label[kept].all() or not label[kept].any()
+    return threshold if same else best_cut(score[kept], label[kept])
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """A probability that never falls with the score: linear between knots, constant beyond them."""

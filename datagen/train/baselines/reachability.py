@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.train.baselines.baseline import best_cut, labels, planar_distance_m
+from datagen.train.baselines.baseline import planar_distance_m, refitted_cut
 from datagen.train.baselines.reachability_map import (
     AZIMUTHS,
     ReachabilityMap,
@@ -24,7 +24,6 @@ from datagen.train.baselines.reachability_map import (
     reachability_map,
 )
 from datagen.train.inputs import F32, F64, Array, Batch, Bools, is_clear
-from datagen.train.scorers import scored
 from datagen.workers.robots import ROBOTS, robot_limits
 
 _SAME_REACH_M = 0.0015
@@ -71,12 +70,7 @@ class Reachability:
 
     def fit(self, batches: Sequence[Batch[Array]]) -> Reachability:
         """A copy with the best cut; unchanged where all clear candidates have the same label."""
-        label = labels(batches, self.name)
-        score = np.concatenate([scored(self, b) for b in batches])
-        clear = score >= 0
-        if label[clear].all() or not label[clear].any():
-            return self
-        return replace(self, threshold=best_cut(score[clear], label[clear]))
+        return replace(self, threshold=refitted_cut(self, batches, self.threshold))
 
     def state(self) -> dict[str, Any]:
         return {"robots": list(self.robots), "threshold": self.threshold}

@@ -12,16 +12,15 @@ from datagen.schemas.specification import HeuristicParams
 from datagen.train.baselines.baseline import (
     RULED_OUT,
     Unfitted,
-    best_cut,
     is_feasible,
     labels,
     mount_m,
     observed_rho,
     planar_distance_m,
     reach_m,
+    refitted_cut,
 )
 from datagen.train.inputs import F64, Array, Batch, Bools, is_clear
-from datagen.train.scorers import scored
 from datagen.workers.labels.distance_visibility_score import heuristic
 
 _BEST_SHARE, _SHARE_WIDTH = 0.75, 0.1
@@ -81,12 +80,7 @@ class ThresholdVisibility:
 
     def fit(self, batches: Sequence[Batch[Array]]) -> ThresholdVisibility:
         """A copy with the best cut; unchanged where all feasible candidates have the same label."""
-        label = labels(batches, self.name)
-        score = np.concatenate([scored(self, b) for b in batches])
-        feasible = score >= 0
-        if label[feasible].all() or not label[feasible].any():
-            return self
-        return replace(self, threshold=best_cut(score[feasible], label[feasible]))
+        return replace(self, threshold=refitted_cut(self, batches, self.threshold))
 
     def state(self) -> dict[str, Any]:
         return {"threshold": self.threshold}

@@ -37,9 +37,8 @@ from datagen.train.models.frames import (
     pair_features,
     target_features,
 )
-from datagen.train.models.hand_pooling import N_SEEN_FROM_MOUNT, HandPooling
+from datagen.train.models.hand_pooling import N_SEEN_FROM_MOUNT, HandPooling, tiles
 from datagen.train.models.model import Model, ModelConfig, read_config
-from datagen.train.models.tiles import tiles
 from datagen.train.models.tokens import (
     N_KINDS,
     TARGET_NUMBERS,

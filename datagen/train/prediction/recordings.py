@@ -1,12 +1,14 @@
 """Frames of a recording of ROS 2: colour and depth, the camera's pose in the map by tf, and the map.
 
-Units and axes are those of REP 103, frames those of REP 105, depth images those of REP 118.
+Units and axes are those of REP 103, frames those of REP 105, depth images those of REP 118. Transforms are,
+as tf2 has them, a tree of frames that move.
 """
 
 from __future__ import annotations
 
 import math
 import struct
+from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -16,6 +18,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 from rosbags.rosbag2 import ReaderError
+from scipy.spatial.transform import Rotation, Slerp
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import F32, F64, U8
@@ -24,7 +27,6 @@ from datagen.train.prediction.files import MAX_PIXELS, MAX_SIDE_PX, checked_pose
 from datagen.train.prediction.frames import RgbdImage, SensorFrame, image_frame, moved
 from datagen.train.prediction.intrinsics import Intrinsics, Pinhole
 from datagen.train.prediction.occupancy import OccupancyMap, grid_map
-from datagen.train.prediction.transform_tree import NoTransformError, TransformTree
 from datagen.workers.geometry.transforms import inverse, pose
 
 _ROLES = ("color", "depth", "color_info", "depth_info", "map")
@@ -281,3 +283,80 @@ def _map(bag: Bag, topics: Mapping[str, str], world: str, recorded_ns: int) -> O
     percent = np.asarray(grid.data, np.int8).reshape(info.height, info.width)
     origin = (float(values[0]), float(values[1]), math.atan2(R[1, 0], R[0, 0]))
     return grid_map(f"{bag.path}: {topic}", percent, float(info.resolution), origin)
+
+
+_TYPE = "tf2_msgs/msg/TFMessage"
+_STALE_S = 0.1  # how old the last transform may be
+_MOST = 1_000_000
+
+
+class NoTransformError(InputError):
+    """Where a frame was is unknown, at that time or at all."""
+
+
+class TransformTree:
+    """The transforms of a recording in a window of time (ns), and all that are static."""
+
+    def __init__(self, bag: Bag, window_ns: tuple[int, int] | None) -> None:
+        # By child and parent: rows of time (s), x, y, z, and quaternion x, y, z, w.
+        self._edges: dict[str, dict[str, array[float]]] = {}
+        self._bag, self._fixed, count = bag, set[str](), 0
+        names = [topic for topic, kind in bag.types.items() if kind == _TYPE]
+        for fixed in (True, False):
+            topics = [name for name in names if name.endswith("tf_static") == fixed]
+            for topic, _, data in bag.messages(topics, None if fixed else window_ns):
+                transforms = bag.read(topic, data).transforms
+                count += len(transforms)
+                if count > _MOST:
+                    raise bag.error(topic, f"has more than {_MOST:,} transforms", "Record a shorter one")
+                for each in transforms:
+                    self._add(topic, each, fixed)
+
+    def _add(self, topic: str, each: Any, fixed: bool) -> None:
+        parent, child = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
+        p, q = each.transform.translation, each.transform.rotation
+        row = [stamp_ns(each.header) / 1e9, p.x, p.y, p.z, q.x, q.y, q.z, q.w]
+        if not math.isfinite(sum(row)) or not 0.99 < math.hypot(*row[4:]) < 1.01:
+            problem = f"the transform {parent} -> {child} is no rotation and translation"
+            raise self._bag.error(topic, problem, "Correct its publisher")
+        rows = self._edges.setdefault(child, {}).setdefault(parent, array("d"))
+        if fixed:
+            self._fixed.add(child)
+            del rows[:]
+        rows.extend(row)
+
+    def lacks(self, which: str) -> NoTransformError:
+        """The error for a transform that is not there."""
+        pairs = sorted(f"{parent} -> {child}" for child, rows in self._edges.items() for parent in rows)
+        fix = f"Record /tf and /tf_static; it has {', '.join(pairs[:30])[:1000] or 'no transforms'}"
+        return NoTransformError(self._bag.path, "tf", f"has no transform {which}", fix)
+
+    def poses(self, frame: str, time_ns: int) -> dict[str, F64]:
+        """`T_ancestor_frame` (4, 4) by ancestor, the nearest first. InputError where one is unknown."""
+        found, T = {frame: np.eye(4)}, np.eye(4)
+        if frame not in self._edges:
+            raise self.lacks(f"of the camera's frame {frame!r}")
+        while frame in self._edges:
+            (parent, rows), *others = self._edges[frame].items()
+            if others or parent in found:
+                names = ", ".join(self._edges[frame])
+                raise self._bag.error(
+                    "tf", f"{frame} has the parents {names}", "Frames form a tree (REP 105)"
+                )
+            T = self._at(f"{parent} -> {frame}", frame in self._fixed, rows, time_ns / 1e9) @ T
+            found[parent], frame = T, parent
+        return found
+
+    def _at(self, name: str, fixed: bool, row: array[float], time_s: float) -> F64:
+        """`T_parent_child` (4, 4), interpolated between two stamps."""
+        rows = np.frombuffer(row).reshape(-1, 8)
+        rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
+        k = int(np.searchsorted(rows[:, 0], time_s))
+        low, high = rows[max(k - 1, 0)], rows[min(k, len(rows) - 1)]
+        if not 0 < k < len(rows):
+            if not fixed and abs(low[0] - time_s) > _STALE_S:
+                raise self.lacks(f"{name} within {_STALE_S:g} s of the frame")
+            return pose(low[1:4], low[[7, 4, 5, 6]])
+        share = (time_s - low[0]) / (high[0] - low[0])
+        q = Slerp([0.0, 1.0], Rotation.from_quat(np.stack([low[4:], high[4:]])))(share).as_quat()
+        return pose((1 - share) * low[1:4] + share * high[1:4], q[[3, 0, 1, 2]])

@@ -35,13 +35,13 @@ from datagen.train.training.checkpoints import (
 from datagen.train.training.loop import (
     Position,
     Training,
+    TrainingProgress,
     make_optimiser,
     optimiser_tensors,
     put_optimiser_tensors,
     run_training,
 )
 from datagen.train.training.options import STAGES, Options
-from datagen.train.training.training_progress import TrainingProgress
 
 _POSITION = ("step", "epoch", "best_epoch", "finished")  # fields of both Position and CheckpointHead
 

@@ -14,7 +14,7 @@ from datagen.workers.geometry.mesh import Mesh
 from datagen.workers.objects import shapes
 from datagen.workers.objects.builtin_table import RECIPES
 from datagen.workers.objects.convex import convex_parts, fits_gripper
-from datagen.workers.objects.model import ObjectModel
+from datagen.workers.objects.model import LoadedOnce, ObjectModel
 from datagen.workers.objects.shapes import ParametricSolid
 from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG
 
@@ -22,7 +22,7 @@ from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG
 GENERATOR_VERSION = 1
 
 
-class BuiltinObjects:
+class BuiltinObjects(LoadedOnce):
     """All recipes of `builtin_table`, each built once per process on first use; nothing is read from disk."""
 
     kind = "builtin"
@@ -30,16 +30,9 @@ class BuiltinObjects:
     def __init__(self) -> None:
         self.excluded: Mapping[str, str] = {}
         self._digests = {name: _digest(name) for name in sorted(RECIPES)}
-        self.digest = digest_of(self._digests)
+        self.digest, self._models = digest_of(self._digests), dict[str, ObjectModel]()
 
-    def names(self) -> list[str]:
-        """Usable objects, sorted."""
-        return list(self._digests)
-
-    def load(self, name: str) -> ObjectModel:
-        """The model; the same object at every call. Raises InputError for an unknown name."""
-        if name not in self._digests:
-            raise InputError("builtin objects", name, "does not exist", "See `names()` for all")
+    def _model(self, name: str) -> ObjectModel:
         return _model(name)
 
 

@@ -14,9 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.robots.resources import mesh_path
+from datagen.workers.robots.resources import mesh_path, read_xml
 from datagen.workers.robots.urdf import MOST, read_urdf, rpy_rotation
-from datagen.workers.xml_file import read_xml
 
 _FIX = "Correct the file, or remove it"
 _MOST_PIECES, _MOST_FILES, _DEEPEST = 1000, 100, 20

@@ -21,12 +21,11 @@ from datagen.schemas.safe_files import read_regular
 from datagen.workers.content_cache import CacheFolder
 from datagen.workers.extras import versions_of
 from datagen.workers.objects.decomposition import LATE
-from datagen.workers.objects.model import ObjectModel, ObjectSource
+from datagen.workers.objects.model import LoadedOnce, ObjectModel, ObjectSource
 from datagen.workers.objects.object_files import TABLE, ObjectFiles, find_objects
 from datagen.workers.objects.object_reading import GIVEN, Given, read_object
 from datagen.workers.objects.scan import CACHE, model_of, restored_scan, stored_scan
-from datagen.workers.objects.ycb import YcbObjects
-from datagen.workers.objects.ycb_layouts import INDEXES
+from datagen.workers.objects.ycb import INDEXES, YcbObjects
 from datagen.workers.source_statement import read_statement
 
 # Part of every digest: raise it when the same files are read differently.
@@ -46,7 +45,7 @@ class Found:
     reason: str = ""
 
 
-class FolderObjects:
+class FolderObjects(LoadedOnce):
     """The usable objects of a folder, all examined when it is opened first, then listed in the cache."""
 
     kind = "folder"
@@ -73,27 +72,18 @@ class FolderObjects:
         if not self._found:
             first = next(iter(self.excluded.values()), "there is no mesh, URDF, SDF or MJCF file")
             raise InputError(folder, "", "has no usable object", f"First reason: {first}")
-        self.digest = digest_of({name: each.digest for name, each in self._found.items()})
+        self._digests = {name: each.digest for name, each in self._found.items()}
+        self.digest = digest_of(self._digests)
         self._models: dict[str, ObjectModel] = {}
 
-    def names(self) -> list[str]:
-        """Usable objects, sorted."""
-        return list(self._found)
-
-    def load(self, name: str) -> ObjectModel:
-        """The model; the same object at every call. Raises InputError for an unknown name."""
-        if name not in self._found:
-            reason = self.excluded.get(name, "there is no such object")
-            raise InputError("folder objects", name, reason, "See `names()` for those that can be used")
-        if name not in self._models:
-            found = self._found[name]
-            stored = CACHE.load(f"{found.digest}-folder")
-            if stored is None:
-                scan = read_object(self._files[name], self._root, self._given(name)).scan
-            else:
-                scan = restored_scan(stored)
-            self._models[name] = model_of(name, found.digest, found.mass_kg, scan)
-        return self._models[name]
+    def _model(self, name: str) -> ObjectModel:
+        found = self._found[name]
+        stored = CACHE.load(f"{found.digest}-folder")
+        if stored is None:
+            scan = read_object(self._files[name], self._root, self._given(name)).scan
+        else:
+            scan = restored_scan(stored)
+        return model_of(name, found.digest, found.mass_kg, scan)
 
     def _given(self, name: str) -> Given:
         return {**self._table.get(ALL, {}), **self._table.get(name, {})}

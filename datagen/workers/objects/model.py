@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import F32, Mesh
 
 
@@ -41,3 +42,28 @@ class ObjectSource(Protocol):
     def load(self, name: str) -> ObjectModel:
         """The model, cached. Raises InputError that names the file, the object and the field."""
         ...
+
+
+class LoadedOnce:
+    """A source whose models are made by `_model` and kept; `_digests` has those of the usable objects."""
+
+    kind: str
+    excluded: Mapping[str, str]
+    _digests: Mapping[str, str]
+    _models: dict[str, ObjectModel]
+
+    def names(self) -> list[str]:
+        """Usable objects, sorted."""
+        return list(self._digests)
+
+    def load(self, name: str) -> ObjectModel:
+        """The model; the same object at every call. Raises InputError for an unknown name."""
+        if name not in self._digests:
+            reason = self.excluded.get(name, "there is no such object")
+            raise InputError(f"{self.kind} objects", name, reason, "See `names()` for those that can be used")
+        if name not in self._models:
+            self._models[name] = self._model(name)
+        return self._models[name]
+
+    def _model(self, name: str) -> ObjectModel:
+        raise NotImplementedError

@@ -15,10 +15,9 @@ from datagen.schemas.safe_files import open_regular
 from datagen.workers.content_cache import Arrays, CacheFolder
 from datagen.workers.geometry.mesh import F32, Mesh, Texture
 from datagen.workers.objects.convex import ConvexParts, fits_gripper, read_convex_parts
-from datagen.workers.objects.materials import texture_of_materials
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.objects.obj_file import MAX_FILE_BYTES, ObjMesh, read_obj
-from datagen.workers.objects.texture import face_colours, read_texture
+from datagen.workers.objects.texture import face_colours, read_texture, texture_of_materials
 
 # Part of every digest: raise it when the same files, if they were read before, are read differently.
 READER_VERSION = 1

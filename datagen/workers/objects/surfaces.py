@@ -13,13 +13,18 @@ import numpy.typing as npt
 from PIL import Image
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.safe_files import read_regular
+from datagen.schemas.safe_files import is_inside, read_regular
 from datagen.workers.extras import how_to_get
 from datagen.workers.geometry.mesh import F64, U8, Mesh, Texture
 from datagen.workers.houses.glb import DAMAGE, MAX_FACES, read_pieces
-from datagen.workers.objects.materials import Material, read_materials
 from datagen.workers.objects.obj_file import read_obj
-from datagen.workers.objects.texture import face_colours, read_texture, reduced_image
+from datagen.workers.objects.texture import (
+    Material,
+    face_colours,
+    read_materials,
+    read_texture,
+    reduced_image,
+)
 
 I64 = npt.NDArray[np.int64]
 
@@ -108,11 +113,8 @@ class SurfaceReader:
 
     def inside(self, path: Path) -> Path:
         """The path. Raises InputError where it leads out of the folder."""
-        try:
-            if path.resolve().is_relative_to(self.root):
-                return path
-        except (OSError, ValueError, RuntimeError):  # a NUL, a name too long, a loop of links
-            pass
+        if is_inside(self.root, path):
+            return path
         raise InputError(path, "", "is not inside the folder of the objects", "Copy it there")
 
     def read(self, path: Path) -> Surface:

@@ -11,8 +11,7 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.robots.resources import mesh_path
-from datagen.workers.xml_file import read_xml
+from datagen.workers.robots.resources import mesh_path, read_xml
 
 _MAX_LINKS, _LONGEST, _LONGEST_PATH = 1000, 200, 1000
 MOST = 1e6  # of a number, whose squares and products stay finite

@@ -13,9 +13,9 @@ from urllib.request import Request, urlopen
 import pytest
 
 from datagen import cli
-from datagen.cluster.environment import JOB_ENVIRONMENT
 from datagen.cluster.ray_head import Head, running_head, state_folder, stop_head
 from datagen.cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
+from datagen.cluster.ray_settings import JOB_ENVIRONMENT
 from datagen.jobs.detach import hand_over
 from datagen.schemas.jobs import Jobs
 from datagen.schemas.storage import open_storage
@@ -28,7 +28,7 @@ from tests.small_runs import PER_SCENE, submit_arguments
 PROGRAM = f"""
 import hashlib, json, os, sys, time
 from pathlib import Path
-from datagen.cluster.environment import job_environment
+from datagen.cluster.ray_settings import job_environment
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 def seen():
     return hashlib.sha256(os.environ["{SECRET}"].encode()).hexdigest()

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from datagen import cli
-from datagen.reports.spending import QUARANTINED, account_for
+from datagen.reports.audit import QUARANTINED, account_for
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, LedgerEntry, Outcome
 from tests.made_runs import attempt, give_up, make_run

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from datagen.train.models import Model
 from datagen.train.models.frames import frames_of, pair_features
-from datagen.train.models.tiles import tiles
+from datagen.train.models.hand_pooling import tiles
 from tests.train.models.made_batches import drawn_tables, mirrored, small_model, turned_about_z
 
 

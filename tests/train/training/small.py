@@ -8,9 +8,8 @@ from typing import Any
 
 from torch import Tensor
 
-from datagen.train.training.loop import run_training
+from datagen.train.training.loop import TrainingStep, run_training
 from datagen.train.training.options import Options
-from datagen.train.training.training_progress import TrainingStep
 from datagen.train.training.training_setup import TrainingJob, prepare_training, save_checkpoint
 
 TINY: dict[str, Any] = {

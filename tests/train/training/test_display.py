@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from datagen.display.progress import Progress
-from datagen.train.training.training_progress import TrainingProgress, TrainingStep
+from datagen.train.training.loop import TrainingProgress, TrainingStep
 
 RECORD: dict[str, Any] = {
     "epoch": 3, "step": 30, "loss": 0.5, "accuracy": 0.7, "val_loss": 0.25, "val_accuracy": 0.875,

@@ -14,9 +14,8 @@ from PIL import Image
 from datagen.schemas.errors import InputError
 from datagen.workers.objects import open_objects
 from datagen.workers.objects.convex import read_convex_parts
-from datagen.workers.objects.materials import texture_of_materials
 from datagen.workers.objects.obj_file import read_obj
-from datagen.workers.objects.texture import read_texture
+from datagen.workers.objects.texture import read_texture, texture_of_materials
 from tests.workers.objects.toy_set import COLLISION_OBJ, CUBE_OBJ, write_bundle, write_maniskill
 
 TWO_MATERIALS = CUBE_OBJ.replace("f 2/1", "usemtl other\nf 2/1")

@@ -12,8 +12,7 @@ from scipy.spatial import ConvexHull
 
 from datagen.schemas.errors import InputError
 from datagen.workers.objects import ObjectModel, ObjectSource, open_objects
-from datagen.workers.objects.exclusions import MAX_DENSITY_KG_M3, MIN_DENSITY_KG_M3
-from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG
+from datagen.workers.objects.ycb_masses import MAX_DENSITY_KG_M3, MIN_DENSITY_KG_M3, PUBLISHED_MASS_KG
 
 # How far a visual vertex may lie outside the convex parts: scans are decomposed to about 2 mm,
 # the wood block's parts are a shrunken box; built-in parts are exact up to float32.
