@@ -1,14 +1,15 @@
-"""Wavefront OBJ read into arrays, with errors that name the line."""
+"""Wavefront OBJ read into arrays in bounded memory, with errors that name the line."""
 
 from __future__ import annotations
 
-import io
 import itertools
 import math
+import re
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,10 +25,11 @@ MAX_FILE_BYTES = 512 * 2**20
 MAX_FACES = 2_000_000
 MAX_VERTICES = 4_000_000
 MAX_LINES = 16_000_000  # faces, vertices, and their texture coordinates and normals
+MAX_NAMES = 100_000  # groups, or materials
 MAX_LINE_BYTES = 2**20
-# What a face's corners have of vertex, texture coordinate and normal: 1/2, 1/2/3, and 1, 1//3.
-_WITH_UV = {(True, True), (True, True, True)}
-_SHAPES = {(True,), (True, False, True), *_WITH_UV}
+_BLOCK_BYTES = 2**16
+_INTEGER = re.compile(rb"-?\d+")
+_CORNERS = re.compile(rb"(?:0 )*0|(?:0/0 )*0/0|(?:0//0 )*0//0|(?:0/0/0 )*0/0/0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,15 +56,29 @@ class ObjMesh:
 def read_obj(path: Path) -> ObjMesh:
     """Reads vertices, texture coordinates, faces and groups; other statements are skipped.
 
-    Raises InputError naming the file and the line or the index at fault: missing or oversized file, no faces,
-    too many faces, unreadable numbers, NaN, index out of range.
+    Works block by block and stops at the first limit passed, so that memory stays near the size
+    of the arrays. Raises InputError naming the file and the line or the index at fault: missing
+    or oversized file, no faces, too many faces, unreadable numbers, NaN, index out of range.
     """
     vertices, uv, faces, uv_faces = array("d"), array("d"), array("q"), array("q")
     starts: dict[bytes, list[int]] = {b"o": [], b"g": []}
     library, materials = "", list[tuple[int, str]]()
-    for number, keyword, rest in _lines(path):
+    for number, kind, line in _pieces(path):
+        keyword, rest = _split(line)
         try:
-            if keyword == b"v":
+            if kind == "v":
+                vertices.frombytes(numbers_of(line, kind).tobytes())
+            elif kind == "vt":
+                uv.frombytes(numbers_of(line, kind).tobytes())
+            elif kind == "f":
+                corners = numbers_of(line, kind)
+                faces.frombytes(corners.tobytes())
+                uv_faces.frombytes(bytes(corners.nbytes))
+            elif kind == "f/":
+                corners = numbers_of(line, kind).reshape(-1, 2)
+                faces.frombytes(corners[:, 0].tobytes())
+                uv_faces.frombytes(corners[:, 1].tobytes())
+            elif keyword == b"v":
                 vertices.extend(_numbers(rest, 3))
             elif keyword == b"vt":
                 uv.extend(_numbers(rest, 2))
@@ -73,15 +89,19 @@ def read_obj(path: Path) -> ObjMesh:
                     uv_faces.extend((t[0], t[k], t[k + 1]))
             elif keyword in starts:
                 starts[keyword].append(len(faces) // 3)
+                if len(starts[keyword]) > MAX_NAMES:
+                    raise ValueError(f"more than {MAX_NAMES:,} groups")
             elif keyword == b"mtllib":
                 library = library or _name(rest)
             elif keyword == b"usemtl":
                 materials.append((len(faces) // 3, _name(rest)))
+                if len(materials) > MAX_NAMES:
+                    raise ValueError(f"more than {MAX_NAMES:,} materials")
         except ValueError as error:
-            shown = printable((keyword + b" " + rest)[:60].decode("utf-8", "replace").strip())
+            shown = printable(line[:60].decode("utf-8", "replace").strip())
             fix = "Export the mesh again as text OBJ"
             raise InputError(path, f"line {number}", f"{error}: {shown!r}", fix) from None
-        if len(faces) > 3 * MAX_FACES or max(len(vertices), len(uv)) > 3 * MAX_VERTICES:
+        if len(faces) > 3 * MAX_FACES or len(vertices) > 3 * MAX_VERTICES or len(uv) > 2 * MAX_VERTICES:
             problem = f"the mesh has more than {MAX_FACES:,} faces or {MAX_VERTICES:,} vertices"
             raise InputError(path, "", problem, "Simplify the mesh")
     if not faces:
@@ -100,34 +120,77 @@ def read_obj(path: Path) -> ObjMesh:
     return mesh
 
 
-def read_obj_header(path: Path) -> tuple[str, tuple[str, ...]]:
-    """The material library and the materials that a file names, without its numbers. Raises InputError."""
+@dataclass(frozen=True)
+class ObjHeader:
+    """Names of the material library and the materials of an OBJ file."""
+
+    material_library: str
+    materials: tuple[str, ...]
+
+
+def read_obj_header(path: Path) -> ObjHeader:
+    """The mtllib and usemtl names of a file, without parsing its numbers. Raises InputError."""
     names: dict[bytes, dict[str, None]] = {b"mtllib": {}, b"usemtl": {}}
-    for _, keyword, rest in _lines(path):
+    for _, _, line in _pieces(path):
+        keyword, name = _split(line)
         if keyword in names:
-            names[keyword][_name(rest)] = None
-    return next(iter(names[b"mtllib"]), ""), tuple(names[b"usemtl"])
+            names[keyword][_name(name)] = None
+            if len(names[keyword]) > MAX_NAMES:
+                raise InputError(path, "", f"the mesh has more than {MAX_NAMES:,} materials", "Join them")
+    return ObjHeader(next(iter(names[b"mtllib"]), ""), tuple(names[b"usemtl"]))
 
 
-def _lines(path: Path) -> Iterator[tuple[int, bytes, bytes]]:
-    """The number from 1, the keyword and the rest of each line that has a keyword.
+def _pieces(path: Path) -> Iterator[tuple[int, str, bytes]]:
+    """Yields (first line number from 1, kind, text) of each run of plain lines, or of one line of kind "".
 
     Lines may end with \\n, \\r\\n or \\r; one that ends with a backslash continues on the next.
     """
-    with open_regular(path, MAX_FILE_BYTES, "Give a text OBJ file of a simplified mesh") as file:
-        refuse_other_kind(path, file.peek(START_BYTES)[:START_BYTES], "text", "Export the mesh as text OBJ")
-        text = io.TextIOWrapper(file, "latin-1")  # a character for each byte
-        number = 0
-        while line := text.readline(MAX_LINE_BYTES):
-            first = number = number + 1
-            while line.endswith("\\\n") and len(line) < MAX_LINE_BYTES and line.lstrip()[0] != "#":
-                line, number = f"{line[:-2]} {text.readline(MAX_LINE_BYTES)}", number + 1
-            if len(line) >= MAX_LINE_BYTES:
-                raise InputError(path, f"line {first}", "the line is too long", "Give a text OBJ file")
-            if number > MAX_LINES:
+    number = 1
+    for block in _blocks(path):
+        start = 0
+        while start < len(block):
+            kind, end = plain_run(block, start)
+            while not kind and block[start:end].endswith(b"\\\n") and end < len(block):
+                if block[start:end].lstrip().startswith(b"#"):
+                    break
+                end = block.find(b"\n", end) + 1 or len(block)
+            piece = block[start:end]
+            lines = piece.count(b"\n") or 1
+            if not kind and len(piece.rstrip(b"\n")) >= MAX_LINE_BYTES:
+                raise InputError(path, f"line {number}", "the line is too long", "Give a text OBJ file")
+            if number + lines - 1 > MAX_LINES:
                 raise InputError(path, "", f"more than {MAX_LINES:,} lines", "Simplify the mesh")
-            if words := line.encode("latin-1").split(None, 1):
-                yield first, words[0], words[1] if len(words) > 1 else b""
+            yield number, kind, piece if kind else piece.replace(b"\\\n", b" ")
+            number, start = number + lines, end
+
+
+def _blocks(path: Path) -> Iterator[bytes]:
+    """The file in blocks of whole lines, each with \\n at its end, continued lines in one block."""
+    with open_regular(path, MAX_FILE_BYTES, "Give a text OBJ file of a simplified mesh") as file:
+        fix = "Export the mesh as text OBJ"
+        refuse_other_kind(path, file.read(START_BYTES), "text", fix)
+        file.seek(0)
+        rest = b""
+        while block := file.read(_BLOCK_BYTES):
+            block = rest + block
+            held = b"\r" if block.endswith(b"\r") else b""  # perhaps the first half of \r\n
+            if b"\r" in block:
+                block = block[: len(block) - len(held)].replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+            end = block.rfind(b"\n") + 1
+            while block[:end].endswith(b"\\\n"):
+                end = block.rfind(b"\n", 0, end - 1) + 1
+            if end:
+                yield block[:end]
+            rest = block[end:] + held
+            if len(rest) > MAX_LINE_BYTES:  # `_pieces` names its line
+                break
+        yield rest.replace(b"\r", b"\n")
+
+
+def _split(line: bytes) -> tuple[bytes, bytes]:
+    """The keyword of a line and what follows it."""
+    words = line.split(None, 1)
+    return (words[0] if words else b""), (words[1] if len(words) > 1 else b"")
 
 
 def _name(text: bytes) -> str:
@@ -142,8 +205,9 @@ def _of_faces(materials: list[tuple[int, str]], n_faces: int) -> tuple[str, ...]
 
 def _numbers(text: bytes, width: int) -> list[float]:
     """The first `width` numbers. Raises ValueError if there are fewer, or one is not finite."""
+    words = text.split()[:width]
     try:
-        values = list(map(float, text.split()[:width]))
+        values = [float(word) for word in words]
     except ValueError:
         values = []
     if len(values) < width or b"_" in text:
@@ -158,13 +222,13 @@ def _corners(text: bytes, n_vertices: int, n_uv: int) -> tuple[list[int], list[i
 
     Negative ones count back from `n_vertices` and `n_uv`. Raises ValueError for an invalid face.
     """
-    corners = [word.split(b"/") for word in text.split()]
-    shapes = {tuple(map(bool, corner)) for corner in corners}
-    if len(corners) < 3 or len(shapes) > 1 or not shapes <= _SHAPES or b"_" in text:
+    shape = _INTEGER.sub(b"0", b" ".join(text.split()))
+    if not _CORNERS.fullmatch(shape) or shape.count(b" ") < 2:
         raise ValueError("a face needs 3 or more corners, all alike")
-    v = _from_first([int(corner[0]) for corner in corners], n_vertices)
-    has_uv = shapes <= _WITH_UV
-    return v, _from_first([int(corner[1]) for corner in corners], n_uv) if has_uv else [0] * len(v)
+    indices = list(map(int, text.replace(b"/", b" ").split()))
+    each = len(indices) // (shape.count(b" ") + 1)
+    v = _from_first(indices[::each], n_vertices)
+    return v, _from_first(indices[1::each], n_uv) if b"0/0" in shape else [0] * len(v)
 
 
 def _from_first(indices: list[int], seen: int) -> list[int]:
@@ -188,3 +252,35 @@ def _check_indices(path: Path, mesh: ObjMesh) -> None:
                 f"refers to {kind} {int(high.max()) + 1} of {count}",
                 "Export the mesh again; it may be cut off",
             )
+
+
+# Numbers too short to overflow, and indices that a face may have; the slow reader parses other lines.
+_NUMBER = rb" -?\d{1,18}(?:\.\d{1,18})?(?:e[-+]?\d\d?)?"
+_INDEX = rb" [1-9]\d{0,6}"
+_PAIR = _INDEX + rb"/[1-9]\d{0,6}"
+_KINDS = {
+    "v": rb"v" + 3 * _NUMBER,
+    "vt": rb"vt" + 2 * _NUMBER,
+    "f": rb"f" + 3 * _INDEX,
+    "f/": rb"f" + 3 * _PAIR,
+}
+# Not possessive (`++`), which Python 3.11 before 3.11.5 matches wrongly.
+_RUN = re.compile(b"|".join(rb"((?:" + line + rb" ?\r?\n)+)" for line in _KINDS.values()))
+_NAMES = tuple(_KINDS)
+
+
+def plain_run(text: bytes, start: int) -> tuple[str, int]:
+    """The kind and end of the plain lines that begin at `start`; kind "" and the line's end for others.
+
+    Kinds are `v`, `vt`, `f` (triangles of vertices) and `f/` (of vertices and texture coordinates).
+    """
+    run = _RUN.match(text, start)
+    if run is not None and run.lastindex is not None:
+        return _NAMES[run.lastindex - 1], run.end()
+    return "", text.find(b"\n", start) + 1 or len(text)
+
+
+def numbers_of(run: bytes, kind: str) -> npt.NDArray[Any]:
+    """All numbers of a run, in order: float64, or int64 from 1 for faces."""
+    text = run.replace(kind[0].encode(), b"").replace(b"t", b"").replace(b"/", b" ")
+    return np.fromstring(text, np.int64 if kind[0] == "f" else np.float64, sep=" ")

@@ -178,9 +178,9 @@ def _maniskill(folder: Path, index: Path) -> list[Entry]:
     for name, model in sorted(_validated(index, _MODELS).items()):
         home = _inside(folder, index, name, f"models/{name}")
         visual = home / "textured.obj"
-        named, materials = read_obj_header(visual)
-        library = _inside(home, visual, "mtllib", named or "textured.mtl")
-        image = texture_of_materials(library, materials)
+        header = read_obj_header(visual)
+        library = _inside(home, visual, "mtllib", header.material_library or "textured.mtl")
+        image = texture_of_materials(library, header.materials)
         collision = next((c for c in (home / "collision.ply", home / "collision.obj") if c.is_file()), None)
         if collision is None:
             raise InputError(

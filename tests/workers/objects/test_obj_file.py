@@ -78,7 +78,11 @@ def test_any_bytes_are_read_or_refused_in_one_line(
         assert np.isfinite(mesh.vertices).all()
 
 
-def test_lines_are_read_to_the_last_bit(tmp_path: Path) -> None:
+@pytest.mark.parametrize("block_bytes", [7, 100, 2**16])
+def test_plain_lines_and_others_are_read_to_the_last_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int
+) -> None:
+    """Wherever the file is cut into blocks; a second space is enough for the slow reader."""
     rng = np.random.default_rng(0)
     vertices = rng.uniform(-1, 1, (400, 3)) * 10.0 ** rng.integers(-12, 12, (400, 1))
     faces = rng.integers(1, 401, (300, 6))
@@ -86,6 +90,7 @@ def test_lines_are_read_to_the_last_bit(tmp_path: Path) -> None:
     lines += [f"vt {x!r} {y!r}" for x, y, _ in vertices.tolist()]
     lines += ["f {}/{} {}/{} {}/{}".format(*face) for face in faces.tolist()]
     others = [line.replace(" ", "  ", 1) if k % 7 < 3 else line for k, line in enumerate(lines)]
+    monkeypatch.setattr(obj_file, "_BLOCK_BYTES", block_bytes)
     for written in (lines, others):
         (tmp_path / "mesh.obj").write_text("\n".join(written))
         mesh = read_obj(tmp_path / "mesh.obj")
@@ -146,9 +151,13 @@ def test_limits_stop_the_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             read_obj(missing)
 
 
+@pytest.mark.parametrize("block_bytes", [1, 7, 64, 2**16])
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-def test_lines_are_numbered_and_joined(end: str, tmp_path: Path) -> None:
+def test_lines_are_numbered_and_joined_wherever_the_file_is_cut(
+    end: str, block_bytes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lines = ["# ends in \\", "v 0 0 0", "v 1 \\", "0 \\", "0", "v\t0 1 0", "", "f 1 2 3", "f 1 2 9x"]
+    monkeypatch.setattr(obj_file, "_BLOCK_BYTES", block_bytes)
     path = tmp_path / "mesh.obj"
     path.write_bytes(end.join(lines[:-1]).encode())
     mesh = read_obj(path)
