@@ -43,7 +43,14 @@ _PICTURES = {"matplotlib": "matplotlib", "PIL": "pillow", "scipy": "scipy"}
 EXTRAS: dict[str, Extra] = {
     "labels": Extra(
         "heuristic labels; show, relabel, verify --replay",
-        {"coacd": "coacd", "embreex": "embreex", "sapien": "sapien", "trimesh": "trimesh", **_PICTURES},
+        {
+            "coacd": "coacd",
+            "embreex": "embreex",
+            "sapien": "sapien",
+            "trimesh": "trimesh",
+            "yaml": "pyyaml",
+            **_PICTURES,
+        },
     ),
     "sim": Extra("plan and sim labels", {"coal": "coal", "numba": "numba", "mani_skill": "mani-skill"}),
     "robots": Extra(
