@@ -56,4 +56,6 @@ def _kind_of(folder: Path) -> str:
         raise InputError(folder, "", "is not a folder", "Give a folder of houses or objects, or KIND:DIR")
     if any(path.name.endswith((".jsonl", ".jsonl.gz")) for path in folder.iterdir()):
         return "procthor"
+    if any(path.with_suffix(".toml").exists() for path in folder.glob("*.yaml")):
+        return "map"
     return "ai2thor" if (folder / "configs" / "scenes").is_dir() else "folder"
