@@ -9,6 +9,7 @@ from typing import Any
 from datagen.display.progress import Progress
 from datagen.schemas.errors import InputError
 from datagen.workers.houses import HOUSE_SOURCES, open_houses
+from datagen.workers.houses.procthor import house_documents
 from datagen.workers.objects import OBJECT_SOURCES, ObjectSource, open_objects
 from datagen.workers.source_statement import STATEMENT
 from datagen.workers.survey import Survey, survey_sources
@@ -58,4 +59,6 @@ def _kind_of(folder: Path) -> str:
         return "procthor"
     if any(path.with_suffix(".toml").exists() for path in folder.glob("*.yaml")):
         return "map"
+    if any(house_documents(folder)):
+        return "procthor"
     return "ai2thor" if (folder / "configs" / "scenes").is_dir() else "folder"
