@@ -59,6 +59,8 @@ def _kind_of(folder: Path) -> str:
         return "procthor"
     if any(path.with_suffix(".toml").exists() for path in folder.glob("*.yaml")):
         return "map"
+    if any(folder.glob("*.scene_dataset_config.json")):
+        return "habitat"
     if any(house_documents(folder)):
         return "procthor"
     return "ai2thor" if (folder / "configs" / "scenes").is_dir() else "folder"

@@ -124,9 +124,10 @@ _THINNEST_M = 0.004
 
 # Last words of names that are no name of a type.
 _SYNONYMS = {
-    "bookcase": "ShelvingUnit", "bookshelf": "ShelvingUnit", "cupboard": "Cabinet", "couch": "Sofa",
-    "island": "CounterTop", "lamp": "DeskLamp", "nightstand": "SideTable", "refrigerator": "Fridge",
-    "sideboard": "Dresser", "wardrobe": "Dresser",
+    "bookcase": "ShelvingUnit", "bookshelf": "ShelvingUnit", "couch": "Sofa", "counter": "CounterTop",
+    "cupboard": "Cabinet", "drawers": "Dresser", "island": "CounterTop", "lamp": "DeskLamp",
+    "nightstand": "SideTable", "refrigerator": "Fridge", "shelves": "Shelf", "sideboard": "Dresser",
+    "wardrobe": "Dresser",
 }  # fmt: skip
 
 

@@ -13,6 +13,7 @@ HOUSE_SOURCES: dict[str, str] = {
     "builtin": "datagen.workers.procedural_houses.builtin:open_builtin",
     "procthor": "datagen.workers.houses.procthor:open_procthor",
     "ai2thor": "datagen.workers.houses.ai2thor:open_ai2thor",
+    "habitat": "datagen.workers.houses.habitat:open_habitat",
     "map": "datagen.workers.houses.map_rooms:open_map",
 }
 
