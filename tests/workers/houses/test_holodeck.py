@@ -59,6 +59,7 @@ def test_annotations_give_the_sizes_of_the_others(tmp_path: Path) -> None:
     assert [s.height_m for s in house.surfaces] == pytest.approx([s.height_m for s in plain.surfaces])
 
 
+@settings(max_examples=30)
 @given(st.floats(0.3, 2.0), st.floats(0.3, 1.5), st.floats(0.3, 1.2), st.sampled_from([0, 90, 180, 270]))
 def test_any_piece_has_its_own_size_and_place(
     tmp_path_factory: pytest.TempPathFactory, x: float, y: float, z: float, yaw: int
