@@ -98,10 +98,7 @@ def _assets(root: JsonNode) -> Iterator[Asset]:
 
 def _own_entry(key: str, entry: JsonNode) -> Asset:
     asset_id = JsonNode(entry.place, entry.path, key).text()
-    sides = [_side(s) for s in entry.get("size").items(3)]
-    if len(sides) != 3:
-        raise entry.get("size").error(f"has {len(sides)} numbers, not 3")
-    width, height, depth = sides
+    width, height, depth = (max(side, _THINNEST_M) for side in entry.get("size").numbers(3, 0.0, _MAX_SIZE_M))
     rest = entry.find("surface_height_m")
     basis = entry.find("surface_basis")
     rest_height_m = None if rest is None else rest.number(0.0, 2 * _MAX_SIZE_M)

@@ -19,7 +19,7 @@ HOUSE_SOURCES: dict[str, str] = {
 
 
 def open_houses(ref: str) -> HouseSource:
-    """The source that a reference names: `builtin`, `procthor:DIR` or `ai2thor:DIR`."""
+    """The source that a reference names: `builtin`, or procthor, ai2thor, habitat or map with `:PATH`."""
     return open_source(HOUSE_SOURCES, ref, "--houses")
 
 

@@ -297,13 +297,11 @@ def _configured(config: Path, root: Path) -> AssetFiles:
         paths.append(path)
     mesh, collision = paths[0] or config.with_name(config.name.split(".")[0] + ".glb"), paths[1]
     up, scale = node.find("up"), node.find("scale")
-    if up is not None and np.abs(np.subtract(_numbers(up, 3, 1.0), (0.0, 1.0, 0.0))).max() > 1e-3:
+    if up is not None and np.abs(np.subtract(up.numbers(3, -1.0, 1.0), (0.0, 1.0, 0.0))).max() > 1e-3:
         raise up.error("is not 0, 1, 0", "Turn the mesh so that y is up")
     if collision is not None and (collision.suffix != ".glb" or not collision.is_file()):
         collision = None
-    factors = (1.0, 1.0, 1.0) if scale is None else tuple(_numbers(scale, 3, 1e3))
-    if scale is not None and min(factors) < 1e-3:
-        raise scale.error("is not positive")
+    factors = (1.0, 1.0, 1.0) if scale is None else tuple(scale.numbers(3, 1e-3, 1e3))
     return AssetFiles(mesh, config, collision, factors)
 
 
@@ -320,7 +318,7 @@ def _centre_m(files: AssetFiles, template: _Template) -> F64:
     config = _config(files)
     centre = None if config is None else config.find("COM")
     if centre is not None:
-        return _Y_UP_TO_WORLD[:3, :3] @ _numbers(centre, 3, EXTENT_M)
+        return _Y_UP_TO_WORLD[:3, :3] @ centre.numbers(3, -EXTENT_M, EXTENT_M)
     return (template.mesh.vertices_m.min(0) + template.mesh.vertices_m.max(0)).astype(np.float64) / 2
 
 
@@ -358,9 +356,9 @@ def _below(node: JsonNode, name: str) -> str:
 
 def _pose(entry: JsonNode) -> F64:
     """`T_world_object` of an instance."""
-    x, y, z = _numbers(entry.get("translation"), 3, EXTENT_M)
+    x, y, z = entry.get("translation").numbers(3, -EXTENT_M, EXTENT_M)
     found = entry.find("rotation")
-    q = np.array([1.0, 0, 0, 0] if found is None else _numbers(found, 4, 2.0))
+    q = np.array([1.0, 0, 0, 0] if found is None else found.numbers(4, -2.0, 2.0))
     if not 0.5 < np.linalg.norm(q) < 2.0:
         raise entry.get("rotation").error("is not a unit quaternion")
     scale = entry.find("uniform_scale")
@@ -372,13 +370,6 @@ def _pose(entry: JsonNode) -> F64:
     T[:3, :3] = rotation_of(q) * factors
     T[:3, 3] = (x, y, z)
     return _in_world(T)
-
-
-def _numbers(node: JsonNode, count: int, limit: float) -> list[float]:
-    values = [n.number(-limit, limit) for n in node.items(count)]
-    if len(values) != count:
-        raise node.error(f"has {len(values)} numbers, not {count}")
-    return values
 
 
 def _in_world(T: F64) -> F64:

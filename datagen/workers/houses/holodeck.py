@@ -52,11 +52,9 @@ def _stated_asset(entry: JsonNode) -> Asset | None:
     yaw = entry.get("rotation").get("y").number(-1e6, 1e6)
     if outline is None or abs(yaw / 90 - round(yaw / 90)) > 1e-3:
         return None
-    points_cm = [
-        [v.number(-_FARTHEST_CM, _FARTHEST_CM) for v in corner.items(2)] for corner in outline.items(16)
-    ]
-    if len(points_cm) < 3 or any(len(p) != 2 for p in points_cm):
-        raise outline.error("is not a list of corners x, z")
+    points_cm = [corner.numbers(2, -_FARTHEST_CM, _FARTHEST_CM) for corner in outline.items(16)]
+    if len(points_cm) < 3:
+        raise outline.error(f"has {len(points_cm)} corners")
     width, depth = ((np.ptp(np.array(points_cm), axis=0) - _GAP_CM) / 100).tolist()
     if round(yaw / 90) % 2:
         width, depth = depth, width

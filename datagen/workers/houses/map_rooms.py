@@ -154,13 +154,13 @@ def _support(node: JsonNode, known: OccupancyMap) -> _Support:
     if polygon is not None:
         if node.find("centre_m") is not None or node.find("size_m") is not None:
             raise node.error("has two outlines", "Give polygon_m, or centre_m and size_m")
-        corners_m = np.array([_pair(p, -EXTENT_M, EXTENT_M) for p in polygon.items(MAX_CORNERS)]).reshape(
+        corners_m = np.array([p.numbers(2, -EXTENT_M, EXTENT_M) for p in polygon.items(MAX_CORNERS)]).reshape(
             -1, 2
         )
     else:
         yaw = 0.0 if (turn := node.find("yaw_deg")) is None else np.deg2rad(turn.number(-360.0, 360.0))
-        x, y = _pair(node.get("centre_m"), -EXTENT_M, EXTENT_M)
-        half_m = np.array(_pair(node.get("size_m"), 0.05, 20.0)) / 2
+        x, y = node.get("centre_m").numbers(2, -EXTENT_M, EXTENT_M)
+        half_m = np.array(node.get("size_m").numbers(2, 0.05, 20.0)) / 2
         T = yaw_pose(x, y, 0.0, float(yaw))
         corners_m = (half_m * [(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ T[:2, :2].T + T[:2, 3]
     x, y, yaw = known.origin
@@ -169,13 +169,6 @@ def _support(node: JsonNode, known: OccupancyMap) -> _Support:
     if isinstance(outline_m, str):
         raise node.error(f"the outline has {outline_m}")
     return _Support(name, height_m, outline_m)
-
-
-def _pair(node: JsonNode, low: float, high: float) -> tuple[float, float]:
-    numbers = [item.number(low, high) for item in node.items(2)]
-    if len(numbers) != 2:
-        raise node.error(f"has {len(numbers)} numbers, not 2")
-    return numbers[0], numbers[1]
 
 
 def _house(house_id: str, digest: str, known: OccupancyMap, wall_m: float, supports: list[_Support]) -> House:

@@ -110,7 +110,7 @@ def no_floor_objects(document: dict) -> None:
 @pytest.mark.parametrize(
     ("spoil", "named"),
     [
-        (no_vertices, r"\$\.objects\[0\]\.vertices: is not a list of corners"),
+        (no_vertices, r"\$\.objects\[0\]\.vertices\[1\]: has 1 numbers, not 2"),
         (tiny, r"\$\.objects\[0\]\.vertices: is of a piece of 0 x 0 x 0\.74 m"),
         (huge, r"\$\.objects\[0\]\.vertices\[0\]\[0\]: 1e\+300"),
         (no_floor_objects, r"\$\.floor_objects: is an object, not a list"),
