@@ -44,7 +44,7 @@ from datagen.workers.source_statement import read_statement
 
 _VERSION = 1
 _KEYS = ("name", "height_m", "centre_m", "size_m", "yaw_deg", "polygon_m")
-_MAX_CELLS, _MAX_SOLIDS, _MAX_SUPPORTS = 4_000_000, 20_000, 500
+_MAX_CELLS, _MAX_SOLIDS, _MAX_SUPPORTS = 2_000_000, 20_000, 100
 _ROOM_M2, _NEAR_M, _UNKNOWN_M, _TOP_M = 1.0, 0.5, 1.0, 0.04
 _WALL_RGB: Rgb = (214, 210, 202)
 _FLOOR_RGB: Rgb = (178, 160, 138)
@@ -96,6 +96,9 @@ def open_map(place: str) -> MapHouses:
     )
     if not place or not files:
         raise InputError(place or "map", "", "has no ROOM.yaml with a ROOM.toml", _FIX)
+    odd = next((p for p in files if not p.name.isprintable()), None)
+    if odd is not None:
+        raise InputError(odd, "", "has a name with unprintable characters", "Rename the file")
     paths, digests, errors = {file.stem: file for file in sorted(files)}, dict[str, str](), list[InputError]()
     for house_id, file in paths.items():
         try:
@@ -177,8 +180,7 @@ def _house(house_id: str, digest: str, known: OccupancyMap, wall_m: float, suppo
     border = int(np.ceil(_UNKNOWN_M / step_m))
     cells = np.pad(known.cells, border, constant_values=UNKNOWN)
     shift_m = -border * step_m
-    centres_m = (np.mgrid[: cells.shape[0], : cells.shape[1]][::-1].reshape(2, -1).T + 0.5) * step_m + shift_m
-    below = [inside_polygon(centres_m, s.outline_m).reshape(cells.shape) for s in supports]
+    below = [_inside(cells.shape, (s.outline_m - shift_m) / step_m) for s in supports]
     free, covered = cells == FREE, np.any(below, axis=0)
     patches, rooms = _rooms(free | covered, free, step_m, shift_m, findings)
     x, y, yaw = known.origin
@@ -253,6 +255,17 @@ def _rooms(
             polygon_m = polygon_m[::-1]
         rooms.append(Room(f"room|{number}", "Room", polygon_m))
     return patches, rooms
+
+
+def _inside(shape: tuple[int, ...], outline: F64) -> Cells:
+    """Whether the centre of each cell lies in an outline (K, 2), in cells."""
+    mask = np.zeros(shape, np.bool_)
+    low, high = np.clip([outline.min(0), outline.max(0) + 1], 0, shape[::-1]).astype(int)
+    y, x = np.mgrid[low[1] : high[1], low[0] : high[0]]
+    mask[low[1] : high[1], low[0] : high[0]] = inside_polygon(
+        np.column_stack([x.ravel(), y.ravel()]) + 0.5, outline
+    ).reshape(x.shape)
+    return mask
 
 
 def _rectangles(mask: Cells) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:

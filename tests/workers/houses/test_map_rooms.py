@@ -196,3 +196,17 @@ def test_labels_are_made_in_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert cli.run(["submit", "heuristic", "--houses", f"map:{path}", *words]) == 0
     assert cli.run(["assets", "check", str(path.parent)]) == 0
     assert "map:" in (out := capsys.readouterr().out) and "1 read" in out
+
+
+def test_a_map_beyond_the_limits_or_with_an_odd_name_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_map(tmp_path / "odd", room_cells(), name="a\tb")
+    with pytest.raises(InputError, match="unprintable"):
+        open_houses(f"map:{tmp_path / 'odd'}")
+    monkeypatch.setattr("datagen.workers.houses.map_rooms._MAX_SOLIDS", 20)
+    with pytest.raises(InputError, match=r"lab\.yaml: image: needs more than 20 boxes"):
+        load(tmp_path, room_cells())
+    monkeypatch.setattr("datagen.workers.houses.map_rooms._MAX_CELLS", 1000)
+    with pytest.raises(InputError, match=r"lab\.yaml: image: has 8,736 cells, more than 1,000"):
+        load(tmp_path, room_cells())
