@@ -32,13 +32,13 @@ from datagen.train.baselines.rules import Proximity, ReachShare
 from datagen.train.prediction import KnownFloor, OccupancyMap, RobotSize, load_scorer, predict, read_footprint
 from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
-from datagen.train.prediction.occupancy import FREE, OCCUPIED, UNKNOWN
 from datagen.train.prediction.pictures import draw_prediction
 from datagen.train.scorers import Scorer
 from datagen.workers.bases.clearance import STEP_M, obstacles_of
 from datagen.workers.geometry.planar import inside_polygon, signed_distances_to_convex
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.houses.house import House
+from datagen.workers.occupancy_map import FREE, OCCUPIED, UNKNOWN
 from datagen.workers.rendering import Camera
 from datagen.workers.rendering.embree import render_rays
 from datagen.workers.rendering.noise import add_noise

@@ -26,11 +26,11 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.shard_reading import read_scenes
 from datagen.schemas.specification import Source, Specification
-from datagen.train.prediction.occupancy import FREE, OCCUPIED, OccupancyMap
 from datagen.workers.bases.clearance import STEP_M
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
+from datagen.workers.occupancy_map import FREE, OCCUPIED, OccupancyMap
 from datagen.workers.rendering.embree import render_rays
 from datagen.workers.scenes import Scene
 from datagen.workers.scenes.generate import generate_scene

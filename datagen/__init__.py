@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from datagen.tables.candidates import candidates
     from datagen.tables.dataset import open_dataset
     from datagen.train.prediction.frames import SensorFrame
-    from datagen.train.prediction.occupancy import OccupancyMap
     from datagen.train.prediction.predict import load_scorer
     from datagen.train.torch_stream import TorchStream, stream
+    from datagen.workers.occupancy_map import OccupancyMap
 
 __all__ = [
     "InputError",

@@ -14,6 +14,7 @@ from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import Mesh
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.houses import HOUSE_SOURCES, open_houses
+from datagen.workers.houses.procthor import house_documents
 from datagen.workers.objects import OBJECT_SOURCES, ObjectModel, ObjectSource, open_objects
 from datagen.workers.rendering import Camera
 from datagen.workers.rendering.embree import RayScene, cast_pixels, ray_mesh
@@ -62,6 +63,12 @@ def _kind_of(folder: Path) -> str:
     if not folder.is_dir():
         raise InputError(folder, "", "is not a folder", "Give a folder of houses or objects, or KIND:DIR")
     if any(path.name.endswith((".jsonl", ".jsonl.gz")) for path in folder.iterdir()):
+        return "procthor"
+    if any(path.with_suffix(".toml").exists() for path in folder.glob("*.yaml")):
+        return "map"
+    if any(folder.glob("*.scene_dataset_config.json")):
+        return "habitat"
+    if any(house_documents(folder)):
         return "procthor"
     return "ai2thor" if (folder / "configs" / "scenes").is_dir() else "folder"
 

@@ -26,8 +26,8 @@ from datagen.workers.robots import robot_limits
 if TYPE_CHECKING:
     from datagen.train.prediction import Footprint, Prediction
     from datagen.train.prediction.frames import SensorFrame
-    from datagen.train.prediction.occupancy import OccupancyMap
     from datagen.train.scorers import Scorer
+    from datagen.workers.occupancy_map import OccupancyMap
 
     Frames = Sequence[str | Path | SensorFrame]
     Maps = Sequence[str | Path | OccupancyMap]

@@ -77,7 +77,7 @@ class SubmitOptions(JobOptions):
     n: Annotated[Whole, option("Labels wanted; a larger number extends the run.", LABELLED)]
     out: Annotated[str | Path, _path("Folder or s3:// address of the run.")]
     houses: Annotated[
-        str | None, option("builtin, procthor:DIR or ai2thor:DIR. [default: builtin]", LABELLED)
+        str | None, option("builtin, or procthor, ai2thor, habitat or map:PATH. [default: builtin]", LABELLED)
     ] = None
     objects: Annotated[str | None, option("builtin, folder:DIR or ycb:DIR. [default: builtin]", LABELLED)] = (
         None

@@ -50,7 +50,8 @@ def draw_plan(axes: Axes, recalled: ReconstructedScene, base_xy_m: F64) -> list[
         axes.add_patch(Polygon(room.polygon_m, closed=True, facecolor="#f4efe6", edgecolor="#c9bfae", lw=0.5))
     solid = [b for b in recalled.house.house.bodies if _height_m(b) > 0.01]
     for body in sorted(solid, key=_height_m):
-        parts = [p for p in body.convex_parts_m if p[:, 2].min() < _HEAD_ROOM_M]
+        # A stage of habitat is one body, with the floor.
+        parts = [p for p in body.convex_parts_m if p[:, 2].min() < _HEAD_ROOM_M and p[:, 2].max() > 0.01]
         outlines = [convex_hull(p[:, :2].astype(np.float64)) for p in parts]
         if outlines:
             colour = "#454545" if body.kind == "wall" else tuple(body.visual.face_rgb.mean(axis=0) / 255)

@@ -38,12 +38,12 @@ def _is_installed(name: str) -> bool:
     return bool(versions_of([name])[name]) if "-" in name else find_spec(name) is not None
 
 
-_PICTURES = {"matplotlib": "matplotlib", "PIL": "pillow", "scipy": "scipy"}
+_FILES = {"matplotlib": "matplotlib", "PIL": "pillow", "scipy": "scipy", "yaml": "pyyaml"}
 
 EXTRAS: dict[str, Extra] = {
     "labels": Extra(
         "heuristic labels; show, relabel, verify --replay",
-        {"coacd": "coacd", "embreex": "embreex", "sapien": "sapien", "trimesh": "trimesh", **_PICTURES},
+        {"coacd": "coacd", "embreex": "embreex", "sapien": "sapien", "trimesh": "trimesh", **_FILES},
     ),
     "sim": Extra("plan and sim labels", {"coal": "coal", "numba": "numba", "mani_skill": "mani-skill"}),
     "robots": Extra(
@@ -56,19 +56,12 @@ EXTRAS: dict[str, Extra] = {
     ),
     "predict": Extra(
         "predict with the released model, benchmark score of it, of files of scores and of rules",
-        {"safetensors": "safetensors", "yaml": "pyyaml", **_PICTURES},
+        {"safetensors": "safetensors", **_FILES},
     ),
     "serve": Extra("serve", {"fastapi": "fastapi", "uvicorn": "uvicorn"}),
     "train": Extra(
         "train, evaluate; predict with other models and as a page",
-        {
-            "torch": "torch",
-            "numba": "numba",
-            "safetensors": "safetensors",
-            "plotly": "plotly",
-            "yaml": "pyyaml",
-            **_PICTURES,
-        },
+        {"torch": "torch", "numba": "numba", "safetensors": "safetensors", "plotly": "plotly", **_FILES},
     ),
     "ros": Extra("predict from recordings of ROS 2, goals as MCAP", {"rosbags": "rosbags"}),
     "cluster": Extra("workers of Ray: several processes, several machines", {"ray": "ray"}),

@@ -60,6 +60,13 @@ class JsonNode(NamedTuple):
             raise self.error(f"{shown} is not within [{low:g}, {high:g}]")
         return float(value)
 
+    def numbers(self, count: int, low: float, high: float) -> list[float]:
+        """A list of so many numbers within [low, high]."""
+        values = [item.number(low, high) for item in self.items(count)]
+        if len(values) != count:
+            raise self.error(f"has {len(values)} numbers, not {count}")
+        return values
+
     def text(self) -> str:
         """A string of at most 500 printable characters, as it is copied into records and arrays."""
         if not isinstance(self.value, str):

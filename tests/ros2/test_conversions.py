@@ -22,8 +22,8 @@ import yaml
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import datagen
-from datagen.train.prediction.occupancy import grid_map
 from datagen.workers.geometry.transforms import pose, translation, yaw_pose
+from datagen.workers.occupancy_map import grid_map
 from tests.conftest import REPOSITORY
 from tests.train.prediction.recorded_scenes import camera_info, grid, image, quaternion, vector
 from tests.train.prediction.seen_scenes import Seen, camera_arrays, draw_seen

@@ -6,8 +6,9 @@ from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import RobotSize
 from datagen.train.prediction.footprints import Footprint, read_footprint
 from datagen.train.prediction.frames import read_frame, read_place
-from datagen.train.prediction.occupancy import KnownFloor, OccupancyMap, read_map
+from datagen.train.prediction.occupancy import KnownFloor
 from datagen.train.prediction.predict import load_scorer, predict
+from datagen.workers.occupancy_map import OccupancyMap, read_map
 
 __all__ = [
     "Footprint",

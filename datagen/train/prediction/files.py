@@ -5,26 +5,18 @@ from __future__ import annotations
 import io
 import math
 import re
-import struct
-import warnings
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
-from PIL import Image
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import DAMAGED_ARRAY, DAMAGED_ZIP, open_member, read_regular
 from datagen.train.inputs import F32, F64, U8, Array, Bools
 from datagen.workers.geometry.transforms import is_pose
+from datagen.workers.image_file import FILE_FIX, MAX_FILE_BYTES, MAX_PIXELS, opened
 from datagen.workers.json_document import JsonNode, parse_json
 
-MAX_SIDE_PX = 8192
-MAX_PIXELS = 4096 * 4096
-MAX_FILE_BYTES = 256 * 2**20
-FILE_FIX = "Name a readable file of at most 256 MiB"
 _MAX_JSON_BYTES = 2**20
 # The largest entry of R R^T - I: poses are often text of four or five digits.
 _POSE_ROUNDING = 1e-3
@@ -33,11 +25,6 @@ _EXTENT_M = 1000.0
 MAX_DEPTH_M = 20.0
 # Medians of depth images of rooms (m), and steps a metre that cameras and data sets have.
 _MEDIAN_M, STEPS = (0.05, 15.0), (1, 1000, 4000, 5000, 10_000)
-# What readers of Pillow raise, above all those of TIFF.
-_DAMAGED_IMAGE = (
-    OSError, ValueError, SyntaxError, EOFError, TypeError, AttributeError, LookupError, ArithmeticError,
-    RuntimeError, struct.error,
-)  # fmt: skip
 NAMES = ("rgb", "depth", "intrinsics", "mask", "T_world_camera")
 _MAX_ARRAY_BYTES = 4 * MAX_PIXELS
 _MAX_RECORDS = 10_000
@@ -48,28 +35,13 @@ _NPZ_FIX = (
 
 def read_rgb(path: Path) -> U8:
     """A colour picture (H, W, 3): PNG, JPEG, TIFF or PPM."""
-    return np.asarray(_opened(path, ("PNG", "JPEG", "TIFF", "PPM"), "RGB"), np.uint8)
+    return np.asarray(opened(path, ("PNG", "JPEG", "TIFF", "PPM"), "RGB"), np.uint8)
 
 
 def read_mask(path: Path) -> Bools:
     """Mask (H, W) of the pixels of a PNG that are not black; an alpha channel is ignored."""
-    pixels = np.asarray(_opened(path, ("PNG",), "RGB"))
+    pixels = np.asarray(opened(path, ("PNG",), "RGB"))
     return np.asarray(pixels.any(axis=2), np.bool_)
-
-
-def parse_yaml(data: bytes, path: Path, fix: str) -> Any:
-    """The first value of a YAML file, also of one of OpenCV. InputError for another one."""
-    try:
-        return next(yaml.safe_load_all(re.sub(rb"(?m)^%.*$|!!opencv-matrix", b"", data)), None)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise InputError(path, "", f"is not YAML ({type(error).__name__})", fix) from None
-
-
-def read_grey(path: Path) -> tuple[U8, U8 | None]:
-    """Grey values (H, W) of a PGM, PNG or BMP, and its opacity where it has one."""
-    image = _opened(path, ("PPM", "PNG", "BMP"), None)
-    alpha = np.asarray(image.getchannel("A"), np.uint8) if image.mode in ("LA", "RGBA") else None
-    return np.asarray(image.convert("L"), np.uint8), alpha
 
 
 def read_depth(path: Path) -> Array:
@@ -80,7 +52,7 @@ def read_depth(path: Path) -> Array:
         return checked_depth(next(iter(found.values())), path)
     if data.startswith(b"\x93NUMPY"):
         return checked_depth(_array(path, "depth", data), path)
-    image = _opened(path, ("PNG", "TIFF", "PPM"), None)
+    image = opened(path, ("PNG", "TIFF", "PPM"), None)
     if not image.mode.startswith("I") and image.mode != "F":
         fix = "Save depth as a 16-bit grey PNG, TIFF or PGM, or as floats in metres (TIFF, .npy)"
         raise InputError(path, "", f"is not a 16-bit depth image (its mode is {image.mode})", fix)
@@ -208,34 +180,3 @@ def _document(path: Path) -> JsonNode:
     return parse_json(
         read_regular(path, _MAX_JSON_BYTES, "Name a readable JSON file of at most 1 MiB"), str(path)
     )
-
-
-def _opened(path: Path, formats: tuple[str, ...], mode: str | None) -> Image.Image:
-    return decoded(read_regular(path, MAX_FILE_BYTES, FILE_FIX), path, formats, mode)
-
-
-def decoded(data: bytes, place: str | Path, formats: tuple[str, ...], mode: str | None = None) -> Image.Image:
-    """A decoded picture. Its size is checked before its pixels are decoded."""
-    kinds = " or ".join(formats)
-    try:
-        with warnings.catch_warnings():
-            # Our own limit of size is stricter than the one that warns; other warnings are of damaged tags.
-            warnings.simplefilter("ignore")
-            with Image.open(io.BytesIO(data), formats=formats) as image:
-                _refuse_size(place, *image.size)
-                image.load()
-                return image.copy() if mode is None else image.convert(mode)
-    except Image.DecompressionBombError:
-        _refuse_size(place, MAX_SIDE_PX + 1, MAX_SIDE_PX + 1)
-        raise
-    except InputError:
-        raise
-    except _DAMAGED_IMAGE as error:
-        problem = f"is not a readable {kinds} image ({type(error).__name__})"
-        raise InputError(place, "", problem, f"Save it again as {kinds}") from None
-
-
-def _refuse_size(place: str | Path, width: int, height: int) -> None:
-    if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS:
-        size = "too many" if width > MAX_SIDE_PX and width == height else f"{width}x{height}"
-        raise InputError(place, "", f"has {size} pixels", f"Give a frame of at most {MAX_PIXELS:,} pixels")

@@ -13,8 +13,9 @@ import numpy as np
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
 from datagen.train.inputs import F32, F64, I64
-from datagen.train.prediction.files import MAX_SIDE_PX, parse_yaml
+from datagen.workers.image_file import MAX_SIDE_PX
 from datagen.workers.json_document import JsonNode, parse_json
+from datagen.workers.yaml_file import parse_yaml
 
 _MAX_JSON_BYTES, _MAX_TEXT_BYTES = 2**20, 2**16
 _FOCAL_PX, _NUMBER = (1.0, 1e5), (-1e6, 1e6)

@@ -9,8 +9,8 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
-from datagen.train.prediction.files import FILE_FIX, MAX_FILE_BYTES
 from datagen.train.prediction.ply import PointFile, cloud_of, columns_of, count_of
+from datagen.workers.image_file import FILE_FIX, MAX_FILE_BYTES
 
 _MAX_HEADER_BYTES = 1 << 16
 _KINDS = {"F4": "f4", "F8": "f8", **{f"{k}{n}": f"{k.lower()}{n}" for k in "UI" for n in (1, 2, 4, 8)}}

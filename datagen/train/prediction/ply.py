@@ -11,7 +11,7 @@ import numpy.typing as npt
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
 from datagen.train.inputs import F32, F64, U8, Bools
-from datagen.train.prediction.files import FILE_FIX, MAX_FILE_BYTES
+from datagen.workers.image_file import FILE_FIX, MAX_FILE_BYTES
 
 MAX_POINTS = 20_000_000
 _MAX_ASCII_POINTS = 2_000_000  # parsed as text they take a hundred times their memory

@@ -23,11 +23,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import F32, F64, U8
 from datagen.train.prediction.bags import DAMAGED, FIX, OTHER_FRAME, Bag, stamp_ns, windows
-from datagen.train.prediction.files import MAX_PIXELS, MAX_SIDE_PX, checked_pose, decoded, valid_depth
+from datagen.train.prediction.files import checked_pose, valid_depth
 from datagen.train.prediction.frames import RgbdImage, SensorFrame, image_frame, moved
 from datagen.train.prediction.intrinsics import Intrinsics, Pinhole
-from datagen.train.prediction.occupancy import OccupancyMap, grid_map
 from datagen.workers.geometry.transforms import inverse, pose
+from datagen.workers.image_file import MAX_PIXELS, MAX_SIDE_PX, decoded
+from datagen.workers.occupancy_map import OccupancyMap, grid_map
 
 _ROLES = ("color", "depth", "color_info", "depth_info", "map")
 _IMAGE, _PACKED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"

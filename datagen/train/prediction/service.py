@@ -20,9 +20,9 @@ from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.files import read_arrays
 from datagen.train.prediction.frames import SensorFrame, read_place
 from datagen.train.prediction.goals import goal_document
-from datagen.train.prediction.occupancy import OccupancyMap, grid_map
 from datagen.train.prediction.prediction_report import document
 from datagen.worker_processes import WorkerProcesses
+from datagen.workers.occupancy_map import OccupancyMap, grid_map
 
 MOST_BYTES, MOST_SESSIONS, MOST_FRAMES = 64 << 20, 8, 6
 _BODY = "body.npz"

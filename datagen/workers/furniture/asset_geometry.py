@@ -122,6 +122,23 @@ _DETAIL_M = 0.02
 _THINNEST_M = 0.004
 
 
+# Last words of names that are no name of a type.
+_SYNONYMS = {
+    "bookcase": "ShelvingUnit", "bookshelf": "ShelvingUnit", "couch": "Sofa", "counter": "CounterTop",
+    "cupboard": "Cabinet", "drawers": "Dresser", "island": "CounterTop", "lamp": "DeskLamp",
+    "nightstand": "SideTable", "refrigerator": "Fridge", "shelves": "Shelf", "sideboard": "Dresser",
+    "wardrobe": "Dresser",
+}  # fmt: skip
+
+
+@lru_cache(maxsize=4096)
+def type_of_name(name: str) -> str:
+    """The type that an English name ends in ("oak coffee table"), the longest one; "Object" if it is none."""
+    letters = "".join(c for c in name if c.isalpha()).lower()
+    types = {kind.lower(): kind for kind in SHAPES} | _SYNONYMS
+    return types.get(max((word for word in types if letters.endswith(word)), key=len, default=""), "Object")
+
+
 @lru_cache(maxsize=8192)
 def asset_geometry(asset: Asset, is_open: bool = False) -> tuple[Mesh, tuple[F32, ...]]:
     """Mesh and convex parts in the asset's own frame, base at z = 0. Shared: never write to them.

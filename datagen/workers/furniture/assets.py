@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 import json
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,9 +14,9 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.json_document import JsonNode, parse_json
 
-TABLE_NAMES = ("asset_sizes.json", "asset-database.json")
+TABLE_NAMES = ("asset_sizes.json", "asset-database.json", "annotations.json.gz", "annotations.json")
 _SUPPORT_HEIGHTS = Path(__file__).with_name("support_heights.json")
-_LARGEST_TABLE_BYTES = 64 << 20
+_LARGEST_TABLE_BYTES = 256 << 20  # unpacked
 _MAX_ASSETS = 200_000
 _MAX_SIZE_M = 20.0
 _THINNEST_M = 1e-4
@@ -39,18 +42,23 @@ class Asset:
         return self.size_m[0] / 2, self.size_m[1] / 2, self.size_m[2]
 
 
-def read_asset_table(folder: Path) -> tuple[dict[str, Asset], bytes]:
+def read_asset_table(folder: Path, *, is_needed: bool = True) -> tuple[dict[str, Asset], bytes]:
     """The folder's size table by asset id, and the bytes that decide on it (for the digest).
 
     Reads `asset_sizes.json` ({assetId: {objectType, size}}), or else AI2-THOR's own
     `asset-database.json` ({objectType: [{assetId, boundingBox}]} or one flat list), which has no
-    heights at which things rest: `support_heights.json` of this package has them.
+    heights at which things rest: `support_heights.json` of this package has them. Or else the
+    annotations of objathor ({assetId: {category, thor_metadata}}), which have none.
     """
     path = next((folder / name for name in TABLE_NAMES if (folder / name).exists()), None)
     fix = "Put asset_sizes.json into the folder; `datagen assets fetch procthor-10k` gets both."
+    if path is None and not is_needed:
+        return {}, b""
     if path is None:
         raise InputError(folder, "", f"has no size table ({' or '.join(TABLE_NAMES)})", fix)
     text = read_regular(path, _LARGEST_TABLE_BYTES, fix)
+    if path.suffix == ".gz":
+        text = _unpacked(path, text, fix)
     root = parse_json(text, str(path))
     assets = {asset.asset_id: asset for asset in _assets(root)}
     if not assets:
@@ -82,16 +90,15 @@ def _assets(root: JsonNode) -> Iterator[Asset]:
         node = JsonNode(root.place, f"$.{key[:100]}", value)
         if isinstance(value, list):
             yield from map(_thor_entry, node.items(_MAX_ASSETS))
+        elif (known := node.find("thor_metadata") or node).find("assetMetadata") is not None:
+            yield _objathor_entry(key, node, known.get("assetMetadata"))
         else:
             yield _own_entry(key, node)
 
 
 def _own_entry(key: str, entry: JsonNode) -> Asset:
     asset_id = JsonNode(entry.place, entry.path, key).text()
-    sides = [_side(s) for s in entry.get("size").items(3)]
-    if len(sides) != 3:
-        raise entry.get("size").error(f"has {len(sides)} numbers, not 3")
-    width, height, depth = sides
+    width, height, depth = (max(side, _THINNEST_M) for side in entry.get("size").numbers(3, 0.0, _MAX_SIZE_M))
     rest = entry.find("surface_height_m")
     basis = entry.find("surface_basis")
     rest_height_m = None if rest is None else rest.number(0.0, 2 * _MAX_SIZE_M)
@@ -108,6 +115,31 @@ def _thor_entry(node: JsonNode) -> Asset:
     box = node.get("boundingBox")
     width, height, depth = (_side(box.get(axis)) for axis in "xyz")
     return Asset(node.get("assetId").text(), node.get("objectType").text(), (width, depth, height))
+
+
+def _objathor_entry(key: str, entry: JsonNode, metadata: JsonNode) -> Asset:
+    """An asset of objathor; its box is a size, or holds one, or two corners."""
+    # Imported here: shapes are made from assets.
+    from datagen.workers.furniture.asset_geometry import type_of_name
+
+    asset_id, box = JsonNode(entry.place, entry.path, key).text(), metadata.get("boundingBox")
+    size, category = box.find("size") or box, entry.find("category") or metadata.get("objectType")
+    if (low := box.find("min")) is None:
+        sides = [_side(size.get(axis)) for axis in "xyz"]
+    else:
+        corners = zip(low.point(), box.get("max").point(), strict=True)
+        sides = [_side(JsonNode(box.place, box.path, b - a)) for a, b in corners]
+    return Asset(asset_id, type_of_name(category.text()), (sides[0], sides[2], sides[1]))
+
+
+def _unpacked(path: Path, data: bytes, fix: str) -> bytes:
+    try:
+        text = gzip.GzipFile(fileobj=io.BytesIO(data)).read(_LARGEST_TABLE_BYTES + 1)
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(path, "", f"is not a whole gzip file ({error})", fix) from None
+    if len(text) > _LARGEST_TABLE_BYTES:
+        raise InputError(path, "", f"unpacks to more than {_LARGEST_TABLE_BYTES:,} bytes", fix)
+    return text
 
 
 def _side(node: JsonNode) -> float:

@@ -13,11 +13,13 @@ HOUSE_SOURCES: dict[str, str] = {
     "builtin": "datagen.workers.procedural_houses.builtin:open_builtin",
     "procthor": "datagen.workers.houses.procthor:open_procthor",
     "ai2thor": "datagen.workers.houses.ai2thor:open_ai2thor",
+    "habitat": "datagen.workers.houses.habitat:open_habitat",
+    "map": "datagen.workers.houses.map_rooms:open_map",
 }
 
 
 def open_houses(ref: str) -> HouseSource:
-    """The source that a reference names: `builtin`, `procthor:DIR` or `ai2thor:DIR`."""
+    """The source that a reference names: `builtin`, or procthor, ai2thor, habitat or map with `:PATH`."""
     return open_source(HOUSE_SOURCES, ref, "--houses")
 
 

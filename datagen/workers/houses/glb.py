@@ -26,6 +26,7 @@ _MAX_TEXTURE_PX = 64_000_000
 _FARTHEST = 1e6  # a scene may scale millimetres
 _PLAIN = (180, 178, 174)
 _FIX = "Download the asset again, or remove the scenes that use it."
+_COMPRESSED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mesh_quantization"}
 # Exceptions of trimesh, which checks little itself, for damaged files: dangling references, values of wrong
 # types, short buffers, cyclic nodes, textures that Pillow cannot read (OSError) or refuses for their size,
 # a stride of 0, numbers beyond 64 bits, compressed meshes (NotImplementedError).
@@ -81,6 +82,9 @@ def _check_header(path: Path, data: bytes) -> None:
         raise InputError(path, "", f"has a description of {length:,} bytes", _FIX)
     root = parse_json(data[20 : 20 + length], str(path))
     try:
+        if packed := _COMPRESSED.intersection(root.value.get("extensionsRequired", [])):
+            fix = "Fetch uncompressed meshes, or decompress them, as gltf-transform does"
+            raise InputError(path, "extensionsRequired", f"is compressed ({', '.join(sorted(packed))})", fix)
         primitives = [p for m in root.value.get("meshes", []) for p in m["primitives"]]
         parts = len(root.value.get("nodes", [])) + len(primitives)
         counts = [int(a["count"]) for a in root.value.get("accessors", [])]
@@ -91,6 +95,8 @@ def _check_header(path: Path, data: bytes) -> None:
                 *[primitive[k] for k in ("indices",) if k in primitive],
             ]
             counts += [counts[k] for k in named]
+    except InputError:
+        raise
     except (ValueError, LookupError, TypeError, AttributeError, OverflowError):
         raise InputError(path, "", "has an invalid description", _FIX) from None
     if parts > _MAX_NODES:

@@ -70,14 +70,17 @@ class LineIndex:
 
 
 def open_lines(path: Path) -> LineIndex:
-    """The index of a .jsonl or .jsonl.gz file. Raises InputError that names the file or its line."""
+    """The index of a .jsonl or .jsonl.gz file, or of a .json file as one line.
+
+    Raises InputError that names the file or its line.
+    """
     expected = "a gzip file" if path.suffix == ".gz" else "text"
     try:
         with open_regular(path, _MAX_FILE_BYTES, _FIX) as stream:
             refuse_other_kind(path, stream.read(START_BYTES), expected, _FIX)
             stream.seek(0)
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
-        packed = cache_folder() / "houses" / f"{digest}-v{_FORMAT}.zip"
+        packed = cache_folder() / "houses" / f"{digest}-v{_FORMAT}{'-whole' * (path.suffix == '.json')}.zip"
         return _opened(path, packed) or _opened(path, _packed(path, packed)) or _in_memory(path)
     except OSError as error:
         if isinstance(error, gzip.BadGzipFile):
@@ -140,7 +143,8 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
             left = _MAX_UNPACKED_BYTES + _MAX_RATIO * os.fstat(file.fileno()).st_size
             stream = cast(IO[bytes], gzip.GzipFile(fileobj=file, mode="rb"))
         for number in itertools.count(1):
-            line = stream.readline(MAX_LINE_BYTES + 1)
+            whole = path.suffix == ".json"
+            line = stream.read(MAX_LINE_BYTES + 1) if whole else stream.readline(MAX_LINE_BYTES + 1)
             if not line:
                 return
             left -= len(line)

@@ -1,4 +1,4 @@
-"""Builds a House in the world frame from a ProcTHOR house document.
+"""Builds a House in the world frame from a house document of ProcTHOR or Holodeck.
 
 The document is in Unity's frame: left-handed, y up, yaw clockwise seen from above, metres. It is
 converted to the world frame (right-handed, z up) by exchanging y and z, which negates yaw. Unknown
@@ -70,7 +70,7 @@ def read_house(root: JsonNode, assets: Mapping[str, Asset]) -> HouseRecord:
     holes = list[Hole]()
     for name in ("doors", "windows"):
         holes += _holes(root.find(name), walls, open_walls, name == "doors", findings)
-    things = read_things(root.get("objects"), assets, findings)
+    things = read_things(root, assets, findings)
     refuse_implausible(root, things, rooms, len(holes), findings)
     return HouseRecord(rooms, floors, walls, holes, things, findings)
 

@@ -1,20 +1,22 @@
-"""Folders of ProcTHOR houses: JSON lines, compressed or not, and a size table."""
+"""Folders of houses of ProcTHOR, as JSON lines, or of Holodeck, as JSON files, and a size table."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
+from datagen.schemas.safe_files import read_regular
 from datagen.workers.furniture.assets import Asset, read_asset_table
 from datagen.workers.furniture.solids import hash_bytes
 from datagen.workers.houses.house import House
-from datagen.workers.houses.line_index import MAX_LINES, Line, LineIndex, open_lines
+from datagen.workers.houses.line_index import MAX_LINE_BYTES, MAX_LINES, Line, LineIndex, open_lines
 from datagen.workers.houses.loader import build_house, read_house
 from datagen.workers.json_document import JsonNode, parse_json
 from datagen.workers.source_statement import read_statement
@@ -66,15 +68,17 @@ def open_procthor(folder: str) -> ProcthorHouses:
     The digest is therefore the same if files are compressed or divided differently.
     """
     path = Path(folder)
-    fix = "Name it as procthor:DIR, where DIR holds *.jsonl.gz and asset_sizes.json."
+    fix = "Name it as procthor:DIR, where DIR holds *.jsonl.gz and asset_sizes.json, or Holodeck's *.json."
     if not folder or not path.is_dir():
         raise InputError(folder or "procthor", "", "no such folder of houses", fix)
-    assets, table = read_asset_table(path)
     with os.scandir(path) as entries:
         found = (e.name for e in entries if e.name.endswith((".jsonl.gz", ".jsonl")))
         names = sorted(itertools.islice(found, _MAX_FILES + 1))
+    documents = () if names else itertools.islice(house_documents(path), _MAX_FILES + 1)
+    names = names or sorted(p.relative_to(path).as_posix() for p in documents)
     if not names:
-        raise InputError(path, "", "has no *.jsonl.gz or *.jsonl file with houses", fix)
+        raise InputError(path, "", "has no *.jsonl.gz, *.jsonl or *.json file with houses", fix)
+    assets, table = read_asset_table(path, is_needed=not names[0].endswith(".json"))
     if len(names) > _MAX_FILES:
         raise InputError(path, "", f"has more than {_MAX_FILES} files", "Join them as JSON lines.")
     files, houses = list[LineIndex](), 0
@@ -85,7 +89,7 @@ def open_procthor(folder: str) -> ProcthorHouses:
         houses += len(files[-1].lines)
         if houses > MAX_LINES:
             raise InputError(path, name, f"has more than {MAX_LINES:,} houses", "Divide them among folders.")
-    places, clashes = _by_id(files)
+    places, clashes = _by_id(files, path)
     if not places:
         raise InputError(path, "", "has files without houses", fix)
     digests = [[house_id, line.sha256] for house_id, (_, line) in places.items()]
@@ -93,13 +97,25 @@ def open_procthor(folder: str) -> ProcthorHouses:
     return ProcthorHouses(digest, path, assets, places, clashes, read_statement(path))
 
 
-def _by_id(files: list[LineIndex]) -> tuple[dict[str, _Place], dict[str, str]]:
+def house_documents(folder: Path) -> Iterator[Path]:
+    """The JSON files of a folder, or of folders in it, that hold a house each."""
+    for path in itertools.chain(folder.glob("*.json"), folder.glob("*/*.json")):
+        with contextlib.suppress(InputError):  # too large to be a house
+            text = read_regular(path, MAX_LINE_BYTES, "")
+            if all(f'"{key}"'.encode() in text for key in ("rooms", "walls", "objects")):
+                yield path
+
+
+def _by_id(files: list[LineIndex], folder: Path) -> tuple[dict[str, _Place], dict[str, str]]:
     """The line of each id, sorted by id, and clashing ids; identical copies of a house count once."""
     found: dict[str, list[_Place]] = defaultdict(list)
     for index in files:
         stem = index.path.name.split(".")[0]
+        own = (
+            index.path.relative_to(folder).with_suffix("").as_posix() if index.path.suffix == ".json" else ""
+        )
         for line in index.lines:
-            found[line.house_id or f"{stem}-{line.number:06d}"].append((index, line))
+            found[line.house_id or own or f"{stem}-{line.number:06d}"].append((index, line))
     places: dict[str, _Place] = {}
     clashes: dict[str, str] = {}
     for house_id in sorted(found):

@@ -22,6 +22,7 @@ from datagen.workers.furniture.assets import (
 )
 from datagen.workers.furniture.places import floor_around, places_of
 from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.houses.holodeck import read_holodeck
 from datagen.workers.houses.house import BodyKind, Surface
 from datagen.workers.json_document import JsonNode
 
@@ -52,12 +53,16 @@ class Thing:
     above_m: float = 0.0  # of a child: height of its lowest point above the highest level of its support
 
 
-def read_things(node: JsonNode, assets: Mapping[str, Asset], findings: Counter[str]) -> list[Thing]:
+def read_things(root: JsonNode, assets: Mapping[str, Asset], findings: Counter[str]) -> list[Thing]:
     """Furniture, each piece followed by the small things on it."""
     out: list[Thing] = []
     seen: set[str] = set()
-    for entry in node.items(MAX_OBJECTS):
+    entries = list(root.get("objects").items(MAX_OBJECTS))
+    own = read_holodeck(root, entries)
+    for entry in entries if own is None else own.furniture:
         asset = assets.get(entry.get("assetId").text())
+        if asset is None and own is not None:
+            asset = own.stated_asset(entry)
         if asset is None:
             findings["unknown assets"] += 1
             continue  # with the objects on it, which would float
@@ -65,7 +70,7 @@ def read_things(node: JsonNode, assets: Mapping[str, Asset], findings: Counter[s
         xy = _centre_xy(entry)
         is_upright = tilt_deg <= _UPRIGHT_DEG
         out.append(Thing(_new_id(entry, seen), "furniture", asset, T_asset, xy, is_upright))
-        for child in _children(entry):
+        for child in _children(entry) if own is None else own.carried[entry.get("id").text()]:
             small = assets.get(child.get("assetId").text())
             if small is None:
                 findings["unknown assets"] += 1

@@ -33,9 +33,7 @@ def clean_polygon(corners_m: F64) -> F64 | str:
     keep = np.linalg.norm(corners_m - np.roll(corners_m, 1, axis=0), axis=1) > _SAME_M
     points = corners_m[keep]
     if len(points) >= 3:
-        before, after = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
-        turn = _cross(before, after)
-        points = points[np.abs(turn) > 1e-9 + 1e-6 * np.linalg.norm(before, axis=1)]
+        points = without_straight_corners(points)
     if len(points) < 3:
         return "fewer than three different corners"
     area_m2 = 0.5 * float(_cross(points, np.roll(points, -1, axis=0)).sum())
@@ -43,6 +41,13 @@ def clean_polygon(corners_m: F64) -> F64 | str:
         return f"an area of {abs(area_m2):.4f} m2"
     points = points if area_m2 > 0 else points[::-1]
     return "edges that cross each other" if _crosses_itself(points) else points
+
+
+def without_straight_corners(points_m: F64) -> F64:
+    """The corners (K, 2) at which a closed line turns."""
+    before, after = points_m - np.roll(points_m, 1, axis=0), np.roll(points_m, -1, axis=0) - points_m
+    turn = _cross(before, after)
+    return points_m[np.abs(turn) > 1e-9 + 1e-6 * np.linalg.norm(before, axis=1)]
 
 
 def triangles(polygon_m: F64) -> list[tuple[int, int, int]]:

@@ -16,8 +16,8 @@ from datagen.train.prediction import KnownFloor, OccupancyMap, RobotSize, predic
 from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import STATES
 from datagen.train.prediction.frames import SensorFrame
-from datagen.train.prediction.occupancy import FREE, OCCUPIED, UNKNOWN
 from datagen.train.scorers import ModelScorer
+from datagen.workers.occupancy_map import FREE, OCCUPIED, UNKNOWN
 from tests.train.prediction.seen_scenes import Seen, sensor_frame
 
 GREY = {FREE: 254, OCCUPIED: 0, UNKNOWN: 205}  # as map_saver writes them

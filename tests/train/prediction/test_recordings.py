@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from datagen.schemas.errors import InputError
-from datagen.train.prediction.occupancy import FREE, OCCUPIED, UNKNOWN
 from datagen.train.prediction.recordings import read_recording
 from datagen.workers.geometry.transforms import inverse, yaw_pose
+from datagen.workers.occupancy_map import FREE, OCCUPIED, UNKNOWN
 from tests.train.prediction.recorded_scenes import (
     COLOR,
     COLOR_INFO,

@@ -134,7 +134,7 @@ def test_folders_and_references_without_houses(tmp_path: Path):
     for ref in ("castle", "", "procthor", "procthor:/no/such/folder", f"procthor:{tmp_path}", "ai2thor:/no"):
         with pytest.raises(InputError):
             open_houses(ref)
-    with pytest.raises(InputError, match="ai2thor, builtin, procthor"):
+    with pytest.raises(InputError, match="ai2thor, builtin, habitat, map, procthor"):
         open_houses("castle:x")
     for ref in ("builtin:0", "builtin:-1", "builtin:many", "builtin:99999999"):
         with pytest.raises(InputError, match="not a number"):

@@ -24,7 +24,7 @@ def named(name: str, **more: object) -> dict:
 
 
 def test_every_source_is_registered_and_its_package_imports_nothing_heavy():
-    assert set(HOUSE_SOURCES) == {"builtin", "procthor", "ai2thor"}
+    assert set(HOUSE_SOURCES) == {"builtin", "procthor", "ai2thor", "habitat", "map"}
     heavy = "('scipy', 'trimesh', 'PIL')"
     code = f"import sys, datagen.workers.houses; print(*(m for m in {heavy} if m in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

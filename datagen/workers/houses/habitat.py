@@ -1,0 +1,430 @@
+"""Scenes of habitat: a stage, and instances of objects with meshes (ReplicaCAD, HSSD, AI2-THOR).
+
+ROOT/NAME.scene_dataset_config.json   names the folders of scenes
+**/NAME.scene_instance.json           stage and object instances
+**/NAME.object_config.json            {render_asset, collision_asset, scale, COM, semantic_id}
+**/NAME.stage_config.json             {render_asset, scale}
+**/NAME.glb                           meshes; also of templates without a configuration
+**/NAME_semantic_lexicon.json         {classes: [{id, name}]}
+
+Frame of the files: right-handed, y up; world (x, y, z) = (x, -z, y). Rotations are quaternions (w, x, y, z).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from datagen.schemas.errors import InputError
+from datagen.schemas.identity import digest_of
+from datagen.schemas.safe_files import open_regular, read_regular
+from datagen.workers.furniture.asset_geometry import type_of_name
+from datagen.workers.furniture.assets import CARRYING_TYPES
+from datagen.workers.geometry.mesh import F32, F64, Mesh
+from datagen.workers.geometry.transforms import rotation_of
+from datagen.workers.houses.glb import MAX_FILE_BYTES, read_glb
+from datagen.workers.houses.habitat_checks import (
+    is_about_centre,
+    refuse_unfit_size,
+    refuse_unfit_stage,
+    refuse_upside_down,
+)
+from datagen.workers.houses.house import House, Room, StaticBody, Surface
+from datagen.workers.houses.loader import room_ids_at
+from datagen.workers.houses.mesh_geometry import (
+    convex_parts,
+    flat_tops,
+    normals_and_areas,
+    outlines,
+    slab_parts,
+)
+from datagen.workers.houses.walls_and_floors import MAX_CORNERS, clean_polygon
+from datagen.workers.json_document import EXTENT_M, JsonNode, parse_json
+from datagen.workers.source_statement import read_statement
+
+SCENE = ".scene_instance.json"
+_DATASET, _OBJECT, _STAGE = ".scene_dataset_config.json", ".object_config.json", ".stage_config.json"
+_LEXICON = "_semantic_lexicon.json"
+_MAX_FILES = 200_000  # files of one kind
+_MAX_SCENE_BYTES = 16 << 20
+_MAX_OBJECTS, _MAX_CLASSES = 5000, 10_000
+_KEPT_MESHES = 512
+_SURFACE_HEIGHTS_M = (0.25, 1.5)
+_WALL_TOP_M = 2.2  # no robot reaches parts above it
+_SMALL_M = 0.35
+_FIX = "Download the scenes again."
+
+# From every file's frame to the world.
+_Y_UP_TO_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+
+# Number, template, its files, entry, `T_world_object`.
+_Instance = tuple[int, str, "AssetFiles", JsonNode, F64]
+
+# The first of these object types found in a room decides the room's type.
+_ROOM_BY_TYPE = (
+    ("Toilet", "Bathroom"), ("ShowerDoor", "Bathroom"), ("Bed", "Bedroom"), ("Fridge", "Kitchen"),
+    ("CounterTop", "Kitchen"), ("Sofa", "LivingRoom"), ("Television", "LivingRoom"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class AssetFiles:
+    """The files of a stage or an object; `scale` (3,) is along the mesh's axes."""
+
+    mesh: Path
+    config: Path | None = None
+    collision: Path | None = None
+    scale: tuple[float, ...] = (1.0, 1.0, 1.0)
+
+
+# The files of the template of a name, which may be a stage; None if there are none.
+FindAsset = Callable[[str, bool], AssetFiles | None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Template:
+    """A mesh of the download in a z-up frame, with its convex parts and digest."""
+
+    mesh: Mesh
+    parts_m: tuple[F32, ...]
+    digest: bytes
+
+
+def known_type(name: str) -> str:
+    """The type that a name ends in, or else the longest type of furniture with a top that it contains."""
+    found = type_of_name(name)
+    return carrying_type(name) if found == "Object" else found
+
+
+def carrying_type(name: str) -> str:
+    """The longest type of furniture with a top that a name contains; "Object" if there is none."""
+    letters = "".join(c for c in name if c.isalpha()).lower()
+    known_types = sorted(CARRYING_TYPES, key=lambda t: -len(t))
+    return next((t for t in known_types if t.lower() in letters), "Object")
+
+
+@dataclass(frozen=True, eq=False)
+class HabitatHouses:
+    """Scenes below one root. Recently used meshes are kept, because houses share furniture."""
+
+    root: Path
+    digest: str
+    scenes: dict[str, Path]
+    types: dict[int, str]
+    find: FindAsset
+    stage_turn: Callable[[str], F64] | None = None  # by house, from the stage's frame to the scene's, y up
+    type_of: Callable[[str], str] = known_type  # of an object without a semantic id
+    carrying: frozenset[str] = CARRYING_TYPES | {"Object"}  # types whose flat tops support objects
+    statement: Mapping[str, str] = field(default_factory=dict)
+    kind: str = "habitat"
+    _templates: OrderedDict[Path, _Template] = field(default_factory=OrderedDict)
+
+    def house_ids(self) -> list[str]:
+        """Ids, sorted: the scene's path below the root, or the folder of scenes, without its ending."""
+        return list(self.scenes)
+
+    def load(self, house_id: str) -> House:
+        """The house. Raises InputError that names the file and the field."""
+        scene, text = self._scene(house_id)
+        digest = hashlib.sha256(text)
+        name = _template_name(scene.get("stage_instance"))
+        if (files := self.find(name, True)) is None:
+            raise scene.get("stage_instance").get("template_name").error(f"has no stage {name!r}", _FIX)
+        stage = self._template(files, is_stage=True)
+        digest.update(stage.digest)
+        turn = np.eye(4) if self.stage_turn is None else self.stage_turn(house_id)
+        mesh = _without_ceiling(stage.mesh.transformed(_in_world(turn)))
+        refuse_unfit_stage(scene.get("stage_instance"), mesh)
+        placed: list[tuple[StaticBody, F64, F64, Mesh]] = []
+        instances, findings = self._instances(scene)
+        for number, name, files, entry, T_world in instances:
+            template = self._template(files)
+            digest.update(template.digest)
+            if is_about_centre(entry, scene):
+                centre_m = _centre_m(files, template)
+                T_world[:3, 3] -= T_world[:3, :3] @ centre_m
+                digest.update(centre_m.tobytes())
+            placed.append(self._placed(number, name, files, template, T_world))
+            refuse_unfit_size(entry, placed[-1][0].visual)
+            digest.update(placed[-1][0].object_type.encode())  # the type decides on support surfaces
+        bodies, rooms = _walls_and_rooms(mesh, [(b, xy) for b, xy, _, _ in placed])
+        owners = room_ids_at(np.array([xy for _, xy, _, _ in placed]).reshape(-1, 2), rooms)
+        surfaces: list[Surface] = []
+        for (body, _, T, local), owner in zip(placed, owners, strict=True):
+            bodies.append(replace(body, room_id=owner))
+            carries = body.object_type in self.carrying
+            if owner and carries and (body.kind == "furniture" or body.object_type in CARRYING_TYPES):
+                surfaces.extend(_surfaces(body, owner, T, local))
+        return House(house_id, digest.hexdigest(), tuple(rooms), tuple(bodies), tuple(surfaces), findings)
+
+    def examine(self, house_id: str) -> Mapping[str, int]:
+        """The findings of the house; its meshes are not read. Raises InputError as `load` does for others."""
+        return self._instances(self._scene(house_id)[0])[1]
+
+    def _scene(self, house_id: str) -> tuple[JsonNode, bytes]:
+        if house_id not in self.scenes:
+            raise InputError(self.root, "", f"has no house {house_id!r}", "Give the id of one of its houses.")
+        text = read_regular(self.scenes[house_id], _MAX_SCENE_BYTES, _FIX)
+        return parse_json(text, str(self.scenes[house_id])), text
+
+    def _instances(self, scene: JsonNode) -> tuple[list[_Instance], Counter[str]]:
+        """The objects whose meshes exist, and the findings."""
+        found: list[_Instance] = []
+        findings = Counter[str]()
+        for number, entry in enumerate(scene.get("object_instances").items(_MAX_OBJECTS)):
+            name = _template_name(entry)
+            if (files := self.find(name, False)) is not None and files.mesh.is_file():
+                found.append((number, name, files, entry, _pose(entry)))
+            else:
+                findings["missing meshes"] += 1
+        jointed = scene.find("articulated_object_instances")
+        if jointed is not None and (count := len(list(jointed.items(_MAX_OBJECTS)))):
+            findings["articulated objects"] = count
+        refuse_upside_down(scene, [T for *_, T in found], findings)
+        return found, findings
+
+    def _template(self, files: AssetFiles, *, is_stage: bool = False) -> _Template:
+        file = files.mesh
+        if file in self._templates:
+            self._templates.move_to_end(file)
+            return self._templates[file]
+        S = np.diag([*files.scale, 1.0])
+        mesh, digest = read_glb(file).transformed(_Y_UP_TO_WORLD @ S), _file_digest(file)
+        solid = mesh
+        if files.collision is not None:
+            solid = read_glb(files.collision).transformed(_Y_UP_TO_WORLD @ S)
+            digest = hashlib.sha256(digest + _file_digest(files.collision)).digest()
+        if files.scale != (1.0, 1.0, 1.0):
+            digest = hashlib.sha256(digest + S.tobytes()).digest()
+        template = _Template(mesh, () if is_stage else convex_parts(solid), digest)
+        self._templates[file] = template
+        if len(self._templates) > _KEPT_MESHES:
+            self._templates.popitem(last=False)
+        return template
+
+    def _placed(
+        self, number: int, name: str, files: AssetFiles, template: _Template, T: F64
+    ) -> tuple[StaticBody, F64, F64, Mesh]:
+        """The body, the point that decides its room, its pose and its mesh in its own frame."""
+        mesh = template.mesh.transformed(T)
+        parts = tuple((p @ T[:3, :3].T + T[:3, 3]).astype(np.float32) for p in template.parts_m)
+        size_m = np.ptp(mesh.vertices_m, axis=0)
+        object_type = self._type_of(name, files)
+        is_small = bool(size_m.max() < _SMALL_M or (mesh.vertices_m[:, 2].min() > 0.2 and size_m.max() < 0.6))
+        asset_id = PurePosixPath(name).name
+        kind = "small" if is_small else "furniture"
+        body = StaticBody(f"{number}|{asset_id}", kind, object_type, asset_id, "", mesh, parts)
+        middle = (mesh.vertices_m.min(0) + mesh.vertices_m.max(0))[:2] / 2
+        return body, middle.astype(np.float64), T, template.mesh
+
+    def _type_of(self, name: str, files: AssetFiles) -> str:
+        """The object type by the semantic id of the template's configuration, else by its name."""
+        config = _config(files)
+        found = None if config is None else config.find("semantic_id")
+        if found is not None:
+            known = self.types.get(int(found.number(-1, 1e9)))
+            if known is not None:
+                return known
+        return self.type_of(PurePosixPath(name).name)
+
+
+def open_habitat(place: str) -> HabitatHouses:
+    """The scenes of a folder's dataset: that with the shortest name, if the folder has several.
+
+    Their configuration may be named in place of the folder. The digest of the source covers the names and
+    sizes of all scenes, meshes and configurations, as that of `open_ai2thor`.
+    """
+    base = Path(place).expanduser()
+    root = base if base.is_dir() else base.parent
+    fix = f"Name it as habitat:DIR, where DIR holds *{_DATASET}, as ReplicaCAD and HSSD do"
+    named = sorted(root.glob(f"*{_DATASET}"), key=lambda p: (len(p.name), p.name))
+    if not place or not base.exists() or not named:
+        raise InputError(place or "habitat", "", f"has no *{_DATASET}", fix)
+    dataset = named[0] if base.is_dir() else base
+    scenes = dict[str, Path]()
+    listing: list[object] = []
+    for folder in _scene_folders(dataset):
+        for path, size in sizes(root / folder, f"*{SCENE}"):
+            scenes[path.relative_to(root).as_posix().removesuffix(SCENE)] = path
+            listing.append([path.relative_to(root).as_posix(), size])
+    if not scenes:
+        raise InputError(dataset, "scene_instances", "names no folder with scenes", _FIX)
+    found = {end: sizes(root, f"*{end}") for end in (".glb", _OBJECT, _STAGE, _LEXICON)}
+    listing += [[p.relative_to(root).as_posix(), n] for files in found.values() for p, n in files]
+    types = {i: name for path, _ in found[_LEXICON] for i, name in _classes(path)}
+    digest = digest_of(["habitat-1", sorted(map(str, listing)), sorted(types.items())])
+    index = {end: {p.name.removesuffix(end): p for p, _ in files[::-1]} for end, files in found.items()}
+
+    def find(name: str, is_stage: bool) -> AssetFiles | None:
+        own = PurePosixPath(name).name
+        config = index[_STAGE if is_stage else _OBJECT].get(own)
+        if config is not None:
+            return _configured(config, root)
+        return None if own not in index[".glb"] else AssetFiles(index[".glb"][own])
+
+    scenes = dict(sorted(scenes.items()))
+    return HabitatHouses(root, digest, scenes, types, find, statement=read_statement(root))
+
+
+def _scene_folders(dataset: Path) -> list[str]:
+    """The folders of scenes that a dataset's configuration names, relative to it."""
+    root = parse_json(read_regular(dataset, 1 << 20, _FIX), str(dataset))
+    paths = root.get("scene_instances").get("paths").get(".json")
+    return [_below(node, node.text()) for node in paths.items(100)]
+
+
+def _classes(path: Path) -> list[tuple[int, str]]:
+    root = parse_json(read_regular(path, 1 << 22, _FIX), str(path))
+    entries = list(root.get("classes").items(_MAX_CLASSES))
+    return [(int(e.get("id").number(-1, 1e9)), type_of_name(e.get("name").text())) for e in entries]
+
+
+def _configured(config: Path, root: Path) -> AssetFiles:
+    """The files that a configuration names. InputError for one outside the root, and for a mesh not y up."""
+    node = parse_json(read_regular(config, 1 << 20, _FIX), str(config))
+    paths = list[Path | None]()
+    for key in ("render_asset", "collision_asset"):
+        named = node.find(key)
+        path = None if named is None else (config.parent / named.text()).resolve()
+        if named is not None and path is not None and not path.is_relative_to(root.resolve()):
+            raise named.error(f"{named.text()!r} is not below {root}")
+        paths.append(path)
+    mesh, collision = paths[0] or config.with_name(config.name.split(".")[0] + ".glb"), paths[1]
+    up, scale = node.find("up"), node.find("scale")
+    if up is not None and np.abs(np.subtract(up.numbers(3, -1.0, 1.0), (0.0, 1.0, 0.0))).max() > 1e-3:
+        raise up.error("is not 0, 1, 0", "Turn the mesh so that y is up")
+    if collision is not None and (collision.suffix != ".glb" or not collision.is_file()):
+        collision = None
+    factors = (1.0, 1.0, 1.0) if scale is None else tuple(scale.numbers(3, 1e-3, 1e3))
+    return AssetFiles(mesh, config, collision, factors)
+
+
+def _config(files: AssetFiles) -> JsonNode | None:
+    path = files.config
+    if path is None or not path.is_file():
+        return None
+    return parse_json(read_regular(path, 1 << 20, _FIX), str(path))
+
+
+def _centre_m(files: AssetFiles, template: _Template) -> F64:
+    """The point (3,) of a template, z up, that a scene may place: its configured centre of mass, or the
+    centre of its bounding box."""
+    config = _config(files)
+    centre = None if config is None else config.find("COM")
+    if centre is not None:
+        return _Y_UP_TO_WORLD[:3, :3] @ centre.numbers(3, -EXTENT_M, EXTENT_M)
+    return (template.mesh.vertices_m.min(0) + template.mesh.vertices_m.max(0)).astype(np.float64) / 2
+
+
+def _file_digest(path: Path) -> bytes:
+    with open_regular(path, MAX_FILE_BYTES, _FIX) as stream:
+        return hashlib.file_digest(stream, "sha256").digest()
+
+
+def sizes(folder: Path, pattern: str) -> list[tuple[Path, int]]:
+    """The files below a folder with their sizes. Raises InputError for too many or unprintable names."""
+    try:
+        found = [(p, p.stat().st_size) for p in itertools.islice(folder.rglob(pattern), _MAX_FILES + 1)]
+    except OSError as error:
+        raise InputError(str(error.filename), "", f"cannot be read: {error.strerror}", _FIX) from None
+    odd = next((p for p, _ in found if not p.relative_to(folder).as_posix().isprintable()), None)
+    if odd is not None:
+        raise InputError(odd, "", "has a name with unprintable characters", "Rename the file.")
+    if len(found) > _MAX_FILES:
+        raise InputError(folder, "", f"has more than {_MAX_FILES:,} files", "Remove some.")
+    return sorted(found)
+
+
+def _template_name(entry: JsonNode) -> str:
+    """A template's path below the assets folder; it may not lead out of it."""
+    node = entry.get("template_name")
+    return _below(node, node.text())
+
+
+def _below(node: JsonNode, name: str) -> str:
+    pieces = PurePosixPath(name).parts
+    if not pieces or name.startswith("/") or ".." in pieces or "\\" in name or "\0" in name:
+        raise node.error(f"{name!r} is not a path below the assets folder")
+    return name
+
+
+def _pose(entry: JsonNode) -> F64:
+    """`T_world_object` of an instance."""
+    x, y, z = entry.get("translation").numbers(3, -EXTENT_M, EXTENT_M)
+    found = entry.find("rotation")
+    q = np.array([1.0, 0, 0, 0] if found is None else found.numbers(4, -2.0, 2.0))
+    if not 0.5 < np.linalg.norm(q) < 2.0:
+        raise entry.get("rotation").error("is not a unit quaternion")
+    scale = entry.find("uniform_scale")
+    stretched = entry.find("non_uniform_scale")
+    factors = np.full(3, 1.0 if scale is None else scale.number(1e-3, 1e3))
+    if stretched is not None:
+        factors = factors * [n.number(1e-3, 1e3) for n in stretched.items(3)]
+    T = np.eye(4)
+    T[:3, :3] = rotation_of(q) * factors
+    T[:3, 3] = (x, y, z)
+    return _in_world(T)
+
+
+def _in_world(T: F64) -> F64:
+    """A pose (4, 4) of the files in the world frame, for meshes that are already z up."""
+    return _Y_UP_TO_WORLD @ T @ np.linalg.inv(_Y_UP_TO_WORLD)
+
+
+def _walls_and_rooms(
+    stage: Mesh, things: list[tuple[StaticBody, F64]]
+) -> tuple[list[StaticBody], list[Room]]:
+    """The stage as a body, and a room for every patch of floor."""
+    normals, _ = normals_and_areas(stage)
+    corner_z = stage.vertices_m[stage.faces][:, :, 2]
+    is_floor = (normals[:, 2] > 0.97) & (np.abs(corner_z).max(1) < 0.05)
+    polygons: list[F64] = []
+    for outline in outlines(stage, is_floor):
+        polygon = clean_polygon(outline)
+        if not isinstance(polygon, str) and len(polygon) <= MAX_CORNERS:
+            polygons.append(polygon)
+    if not polygons:  # the stage has no floor: use the ground below the walls
+        low, high = stage.vertices_m.min(0)[:2], stage.vertices_m.max(0)[:2]
+        polygons = [np.array([low, (high[0], low[1]), high, (low[0], high[1])], np.float64)]
+    plain = [Room(f"room|{k}", "Room", p) for k, p in enumerate(polygons)]
+    owners = room_ids_at(np.array([xy for _, xy in things]).reshape(-1, 2), plain)
+    within: dict[str, set[str]] = {r.room_id: set() for r in plain}
+    for (body, _), owner in zip(things, owners, strict=True):
+        if owner:
+            within[owner].add(body.object_type)
+    rooms: list[Room] = []
+    for room in plain:
+        kind = next((name for t, name in _ROOM_BY_TYPE if t in within[room.room_id]), "Room")
+        rooms.append(replace(room, room_type=kind))
+    parts = slab_parts(stage, 0.02, _WALL_TOP_M)
+    return [StaticBody("stage", "wall", "Wall", "", "", stage, parts)], rooms
+
+
+def _without_ceiling(stage: Mesh) -> Mesh:
+    """The stage, z up, without level faces near its top: houses are lit and seen from above."""
+    normals, _ = normals_and_areas(stage)
+    corner_z = stage.vertices_m[stage.faces][:, :, 2]
+    near_top = corner_z.min(1) > max(1.8, float(stage.vertices_m[:, 2].max()) - 0.5)
+    kept = ~((np.abs(normals[:, 2]) > 0.9) & near_top)
+    return Mesh(stage.vertices_m, stage.faces[kept], stage.face_rgb[kept])
+
+
+def _surfaces(body: StaticBody, room_id: str, T: F64, local: Mesh) -> list[Surface]:
+    """Flat tops of an upright, unstretched body."""
+    if T[2, 2] < 0.999 or abs(np.linalg.det(T[:3, :3]) - 1.0) > 1e-3:
+        return []
+    out: list[Surface] = []
+    base_m = float(T[2, 3])
+    low, high = (h - base_m for h in _SURFACE_HEIGHTS_M)
+    for k, (height, rectangle) in enumerate(flat_tops(local, low, high)):
+        T_surface = T.copy()
+        T_surface[:3, 3] = T[:3, :3] @ (*rectangle.centre_m, height) + T[:3, 3]
+        body_id, size_m = body.body_id, rectangle.size_m
+        out.append(Surface(f"{body_id}/{k}", body_id, body.object_type, room_id, T_surface, size_m))
+    return out
