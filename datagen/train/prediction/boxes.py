@@ -52,7 +52,10 @@ def box_mask(image: RgbdImage, box: Box, T_world_camera: F64) -> Bools:
     around = known & (np.abs(depth_m - near_m) < 0.5)
     top_m = np.percentile(grid[..., 2][around & inside], 95) if (around & inside).any() else 0.0
     lowest_m = above_support(
-        grid, part.facets(T_world_camera), around & ~inside & (grid[..., 2] < top_m), np.array([0.0, 0.0, top_m])
+        grid,
+        part.facets(T_world_camera),
+        around & ~inside & (grid[..., 2] < top_m),
+        np.array([0.0, 0.0, top_m]),
     )
     standing = around & (grid[..., 2] > lowest_m)
     labels = np.zeros(depth_m.shape, np.int64)

@@ -17,7 +17,7 @@ _RAN_OUT, _ROUNDS = 0.95, 4
 _FEW_FAR = 0.01  # share of the region's pixels that may be that far
 _SUPPORT_AREA_M2 = 0.004  # a smaller level surface is no support
 _BIN_M = 0.004
-_LARGEST_M = 0.40  # a larger region is furniture, or several objects
+_LARGEST_M = 0.45  # a larger region is furniture, or several objects
 
 
 def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> Bools:
