@@ -159,24 +159,28 @@ def _with_target(
 ) -> list[SensorFrame]:
     """The frames, the first with the mask of the object that was clicked or boxed."""
     first, image = frames[0], frames[0].image
+    if click is None and box is None:
+        if not any(frame.on_target is not None for frame in frames):
+            fix = (
+                "Give --click u,v, --box, or a mask (in a .ply: a vertex property `target`, 1 on the target)"
+            )
+            raise InputError(first.place, "target", "is not marked", fix)
+        return list(frames)
     if click is not None and box is not None:
         raise InputError("--box", "", "is given with --click", "Give one of them")
-    if click is not None or box is not None:
-        option = "--box" if click is None else "--click"
-        if image is None:
-            raise InputError(option, "", "needs an image, not a cloud", "Give a frame with an image first")
-        if image.mask is not None:
-            raise InputError(option, "", "is given for a frame with a mask", f"Omit {option}, or the mask")
-        T = grounds[0].T_world_camera
-        mask = grow_mask(image, click, T) if click is not None else box_mask(image, box, T) if box else None
-        marked = image_frame(
-            replace(image, mask=mask), first.T_world_camera, {"depth": first.place, "mask": option}
-        )
-        return [marked, *frames[1:]]
-    if not any(frame.on_target is not None for frame in frames):
-        fix = "Give --click u,v, --box, or a mask (in a .ply: a vertex property `target`, 1 on the target)"
-        raise InputError(first.place, "target", "is not marked", fix)
-    return list(frames)
+    option = "--box" if click is None else "--click"
+    if image is None:
+        raise InputError(option, "", "needs an image, not a cloud", "Give a frame with an image first")
+    if image.mask is not None:
+        raise InputError(option, "", "is given for a frame with a mask", f"Omit {option}, or the mask")
+    T = grounds[0].T_world_camera
+    if click is not None:
+        mask = grow_mask(image, click, T)
+    else:
+        assert box is not None
+        mask = box_mask(image, box, T)
+    where = {"depth": first.place, "mask": option}
+    return [image_frame(replace(image, mask=mask), first.T_world_camera, where), *frames[1:]]
 
 
 def _fill(frames: Sequence[SensorFrame]) -> tuple[list[SensorFrame], Filled | None]:
