@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import ndimage
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import F64, Bools
 from datagen.train.prediction.frames import RgbdImage
-from datagen.train.prediction.region_growing import above_support, depth_breaks, refuse_large
+from datagen.train.prediction.region_growing import above_support, depth_breaks, grow_mask, refuse_large
 from datagen.train.prediction.target import from_nearest
 
 Box = tuple[int, int, int, int]
 _AROUND, _SLACK = 0.5, 0.04  # shares of the box: the margin that is looked at; the error of its sides
-_INSIDE = 0.8  # least share of a part's pixels that lie in the box
+# Least share of a part's pixels that lie in the box, and of the sides that a grown region spans.
+_INSIDE, _SPANS = 0.8, 0.7
 _JUMP_M = 0.03  # between the main part and others at the pixels where they are next to each other
 _LEAST_PX, _LEAST_SHARE = 30, 0.05
 _FIX = "Give the sides of a box around the target, or its mask"
@@ -22,9 +25,10 @@ _FIX = "Give the sides of a box around the target, or its mask"
 def box_mask(image: RgbdImage, box: Box, T_world_camera: F64) -> Bools:
     """Mask (H, W) of the object that fills most of a box: left, top, right, bottom; the last two exclusive.
 
-    Parts end where depth jumps, and on the widest level surface. Those that lie in the box belong to the
-    object; if its main part continues outside, it is cut at the box. InputError for a box outside the image,
-    for one in which nothing stands, and for an object of the size of furniture.
+    What a click on its middle selects, if it spans the box. Else parts end where depth jumps, and on the
+    widest level surface; those that lie in the box belong to the object, which is cut at the box if it
+    continues outside. InputError for a box outside the image, for one in which nothing stands, and for an
+    object of the size of furniture.
     """
     h, w = image.depth_m.shape
     text, (left, top, right, bottom) = ",".join(map(str, box)), box
@@ -43,6 +47,12 @@ def box_mask(image: RgbdImage, box: Box, T_world_camera: F64) -> Bools:
     middle = (np.abs(2 * u - left - right) < (right - left) / 2) & (
         np.abs(2 * v - top - bottom) < (bottom - top) / 2
     )
+    found = np.zeros((h, w), np.bool_)
+    cut = np.s_[y0:y1, x0:x1]
+    grown = _grown_in(image, (left, top, right, bottom), T_world_camera)
+    if grown is not None and grown[cut][inside].sum() > _INSIDE * grown.sum():
+        found[cut] = grown[cut] & inside
+        return found
     grid, depth_m = part.world_grid(T_world_camera), part.depth_m
     known = depth_m > 0
     if (known & inside).sum() < _LEAST_PX:
@@ -78,6 +88,20 @@ def box_mask(image: RgbdImage, box: Box, T_world_camera: F64) -> Bools:
     if mask.sum() < max(_LEAST_PX, _LEAST_SHARE * (right - left) * (bottom - top)):
         raise InputError("--box", text, f"has only {mask.sum()} pixels of an object in it", _FIX)
     refuse_large(grid[mask], "--box", text)
-    found = np.zeros((h, w), np.bool_)
-    found[y0:y1, x0:x1] = mask
+    found[cut] = mask
     return found
+
+
+def _grown_in(image: RgbdImage, box: Box, T_world_camera: F64) -> Bools | None:
+    """What a click on the middle of the box selects, if it spans most of the box both ways."""
+    left, top, right, bottom = box
+    v, u = np.nonzero(image.depth_m[top:bottom, left:right])
+    if not len(v):
+        return None
+    k = int(np.hypot(u - (right - left) / 2, v - (bottom - top) / 2).argmin())
+    try:
+        mask = grow_mask(replace(image, source=None), (left + int(u[k]), top + int(v[k])), T_world_camera)
+    except InputError:
+        return None
+    tall, wide = (np.ptp(np.flatnonzero(mask.any(axis))) for axis in (1, 0))
+    return mask if tall > _SPANS * (bottom - top) and wide > _SPANS * (right - left) else None

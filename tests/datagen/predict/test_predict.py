@@ -84,7 +84,9 @@ def test_a_click_and_the_same_frame_as_folder_archive_and_cloud(
     unmarked = frame_with(frame, tmp_path, mask=None)
     middle = np.argmin((v - np.nonzero(mask)[0].mean()) ** 2 + (u - np.nonzero(mask)[1].mean()) ** 2)
     answers["click"] = ["--frame", unmarked, "--click", f"{u[middle]},{v[middle]}"]
-    answers["box"] = ["--frame", unmarked, "--box", f"{u.min()},{v.min()},{u.max() + 1},{v.max() + 1}"]
+    rows, columns = np.nonzero(mask)
+    box = columns.min() - 2, rows.min() - 2, columns.max() + 3, rows.max() + 3
+    answers["box"] = ["--frame", unmarked, "--box", ",".join(map(str, box))]
     found = {name: json_of(capsys, ["predict", checkpoint, *given, *rest]) for name, given in answers.items()}
     whole, cloud = found["folder"], found.pop("ply")
     assert cloud["target"]["center_m"][2] == pytest.approx(whole["target"]["center_m"][2], abs=1e-5)
