@@ -1,6 +1,6 @@
-"""How often one click selects the right object, in annotated frames of cameras and in rendered scenes.
+"""How often a click or a box selects the right object, in annotated frames and in rendered scenes.
 
-    python -m benchmarks.clicks [FOLDER ...] [--scenes 20] [--houses procthor:DIR] [--objects ycb:DIR]
+    python -m benchmarks.clicks [FOLDER ...] [--boxes] [--scenes 20] [--houses procthor:DIR] [--objects ycb:D]
 
 A folder holds frames as `datagen predict` reads them, each with pose.json and labels.png: 16 bits, 0 for what
 is not asked for, 65535 for the room (floor, walls, furniture), another number for each object. Scenes of the
@@ -10,16 +10,18 @@ touches it; exact, with stereo noise, and with the steps of the first Kinect (2.
 Five clicks an object that shows 300 pixels, inside its outline: in its middle, and halfway to its four ends.
 Right: the mask overlaps the object's pixels with depth by at least half (intersection over union), all or
 those of the clicked one of parts into which another object splits it, and holds less than half of any other.
-Five clicks a frame on the room: right if refused.
+Five clicks a frame on the room: right if refused. With --boxes one box an object in place of clicks, 3 pixels
+wider on each side than its pixels.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +31,8 @@ from scipy import ndimage
 from benchmarks.options import drawn_scenes
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import NoiseParams
+from datagen.train.inputs import Bools
+from datagen.train.prediction.boxes import Box, box_mask
 from datagen.train.prediction.frames import Pinhole, RgbdImage, read_place
 from datagen.train.prediction.region_growing import grow_mask
 from datagen.workers.geometry.mesh import F64
@@ -49,7 +53,9 @@ def main() -> None:
     parser.add_argument("--objects", default="builtin")
     parser.add_argument("--seed", type=int, default=77)
     parser.add_argument("--each", action="store_true", help="print objects with a click that is not right")
+    parser.add_argument("--boxes", action="store_true", help="give boxes in place of clicks")
     options = parser.parse_args()
+    select, places = (box_mask, _box) if options.boxes else (grow_mask, _pixels)
     counts: dict[str, npt.NDArray[np.int64]] = {}
     spent = list[float]()
     for source, name, image, T, labels in [*_folders(options.folders), *_scenes(options)]:
@@ -58,33 +64,47 @@ def main() -> None:
         counts[source][0] += 1
         for label in np.unique(labels[labels > 0]):
             asked = (labels == label) & (image.depth_m > 0)
-            if asked.sum() < LEAST_PX:
+            if asked.sum() < LEAST_PX or (label == ROOM and options.boxes):
                 continue
             rng = np.random.default_rng(0)
             said = list[str]()
-            for pixel in _inner(asked, rng) if label == ROOM else _pixels(asked):
+            given: list[Any] = _inner(asked, rng) if label == ROOM else places(asked)
+            middle = _pixels(asked)[0]
+            for place in given:
                 began = time.process_time()
-                said.append(_clicked(image, T, labels, pixel))
+                mask = _selected(select, image, place, T)
                 spent.append(time.process_time() - began)
+                at = middle if options.boxes else place
+                said.append(f"{place} {_verdict(mask, image, labels, at)}")
             if label == ROOM:
                 counts[source][7:] += len(said), sum("refused" in each for each in said)
             else:
                 right, refused = (sum(word in each for each in said) for word in ("right", "refused"))
-                counts[source][1:7] += 1, right == CLICKS, CLICKS, right, refused, CLICKS - right - refused
+                n = len(said)
+                counts[source][1:7] += 1, right == n, n, right, refused, n - right - refused
             if options.each and not all(("refused" if label == ROOM else "right") in each for each in said):
                 print(f"{source} {name} {label}: {'; '.join(said)}")
     head = ("frames", "objects", "all right", "clicks", "right", "refused", "wrong", "on room", "refused")
     print("".join(["source".ljust(24), *(word.rjust(10) for word in head)]))
     for source, row in counts.items():
         print("".join([source.ljust(24), *(str(n).rjust(10) for n in row)]), f"{row[4] / max(row[3], 1):.1%}")
-    print(f"CPU a click: median {1000 * np.median(spent):.0f} ms, most {1000 * max(spent):.0f} ms")
+    print(f"CPU each: median {1000 * np.median(spent):.0f} ms, most {1000 * max(spent):.0f} ms")
 
 
-def _clicked(image: RgbdImage, T: F64, labels: Labels, pixel: tuple[int, int]) -> str:
+def _selected(
+    select: Callable[[RgbdImage, Any, F64], Bools], image: RgbdImage, place: Any, T: F64
+) -> Bools | str:
+    """The mask of what is clicked or boxed, or why it is refused."""
     try:
-        mask = grow_mask(image, pixel, T)
+        return select(image, place, T)
     except InputError as refused:
-        return f"refused {pixel}: {refused.problem}"
+        return refused.problem
+
+
+def _verdict(mask: Bools | str, image: RgbdImage, labels: Labels, pixel: tuple[int, int]) -> str:
+    """Whether a mask is right for the object at a pixel."""
+    if isinstance(mask, str):
+        return f"refused: {mask}"
     known = image.depth_m > 0
     asked = (labels == labels[pixel[1], pixel[0]]) & known
     parts = np.zeros(asked.shape, np.int64)
@@ -98,10 +118,16 @@ def _clicked(image: RgbdImage, T: F64, labels: Labels, pixel: tuple[int, int]) -
         for other in np.unique(labels[mask & ~asked & (labels != ROOM)])
         if other and (mask & (labels == other)).sum() > 0.5 * ((labels == other) & known).sum()
     ]
-    return f"{'right' if overlap >= 0.5 and not held else 'wrong'} {pixel}: {overlap:.2f} {held or ''}"
+    return f"{'right' if overlap >= 0.5 and not held else 'wrong'}: {overlap:.2f} {held or ''}"
 
 
-def _pixels(asked: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _box(asked: Bools) -> list[Box]:
+    (top, *_, bottom), (left, *_, right) = (np.flatnonzero(asked.any(axis)) for axis in (1, 0))
+    h, w = asked.shape
+    return [(max(int(left) - 3, 0), max(int(top) - 3, 0), min(int(right) + 4, w), min(int(bottom) + 4, h))]
+
+
+def _pixels(asked: Bools) -> list[tuple[int, int]]:
     """The middle pixel (u, v) of an object, and those halfway to its four ends, inside its outline."""
     inside = np.asarray(ndimage.distance_transform_edt(np.pad(asked, 1)))[1:-1, 1:-1]
     v, u = np.nonzero(inside > 0.4 * inside.max())
@@ -113,7 +139,7 @@ def _pixels(asked: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(u[k]), int(v[k])) for k in near]
 
 
-def _inner(asked: npt.NDArray[np.bool_], rng: np.random.Generator) -> list[tuple[int, int]]:
+def _inner(asked: Bools, rng: np.random.Generator) -> list[tuple[int, int]]:
     v, u = np.nonzero(asked)
     return [(int(u[k]), int(v[k])) for k in rng.choice(len(v), CLICKS, replace=False)]
 

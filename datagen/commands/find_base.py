@@ -37,7 +37,7 @@ def find_base(
         K: Intrinsics (3, 3) of the undistorted picture, in pixels.
         T_map_camera: Pose (4, 4) of the camera (x right, y down, z ahead) in the map, its floor at z = 0.
             Without it give `camera_height`.
-        mask: Pixels (H, W) of the object; or give `click=(u, v)`.
+        mask: Pixels (H, W) of the object; or give `click=(u, v)` or `box=(left, top, right, bottom)`.
         map: `OccupancyMap`, or a map.yaml of Nav2, or a list of these.
         options: As of `datagen.predict`: `robot`, or `base_height` and `reach`; `arrival`, `allow_unseen`.
 

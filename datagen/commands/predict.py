@@ -89,6 +89,17 @@ def _pixel(kind: Any, tokens: Sequence[Token]) -> tuple[int, int]:
     return int(parts[0]), int(parts[1])
 
 
+def _box(kind: Any, tokens: Sequence[Token]) -> tuple[int, int, int, int]:
+    text = tokens[0].value
+    found = re.fullmatch(r"\s*,\s*".join([r"\s*([0-9]{1,6})"] * 4) + r"\s*", text, re.ASCII)
+    if found is None:
+        raise InputError(
+            "--box", text[:40], "is no box", "Give LEFT,TOP,RIGHT,BOTTOM in pixels: 280,200,360,300"
+        )
+    left, top, right, bottom = map(int, found.groups())
+    return left, top, right, bottom
+
+
 def _text(kind: Any, tokens: Sequence[Token]) -> str:
     return tokens[0].value
 
@@ -118,6 +129,7 @@ class PredictOptions:
             [default: the last frame]
         topic: Topic of the recording, where several fit: color, depth, color_info, depth_info or map=TOPIC.
         click: Pixel u,v on the target in the first frame, where it has no mask.
+        box: Box LEFT,TOP,RIGHT,BOTTOM (pixels) around the target in the first frame, in place of a click.
         camera_height: Height of the frame's camera (m), where it has no pose.
         gravity: Direction of gravity x,y,z in the camera frame (x right, y down).
         robot_camera_height: Height of the robot's own camera (m). [default: that of the frame's camera]
@@ -145,6 +157,9 @@ class PredictOptions:
     at: Annotated[Sequence[float], _UNSET] = ()
     topic: Annotated[Sequence[str], _UNSET] = ()
     click: Annotated[tuple[int, int] | None, Parameter(converter=_pixel, n_tokens=1, metavar="STR")] = None
+    box: Annotated[tuple[int, int, int, int] | None, Parameter(converter=_box, n_tokens=1, metavar="STR")] = (
+        None
+    )
     camera_height: float | None = None
     gravity: Annotated[
         Sequence[float] | None,
@@ -164,7 +179,7 @@ class PredictOptions:
 
     def __post_init__(self) -> None:
         """Raise InputError for options that are out of range or do not go together."""
-        if self.demo and not (self.frame is self.click is self.bag is None):
+        if self.demo and not (self.frame is self.click is self.box is self.bag is None):
             fix = "Omit --demo to predict on a frame of your own"
             raise InputError("--demo", "", "has a frame and a click of its own", fix)
         if self.bag is not None and self.frame is not None:
@@ -271,6 +286,7 @@ def predict(given: PredictOptions) -> Prediction:
         camera_height_m=given.camera_height,
         gravity=direction,
         click=given.click,
+        box=given.box,
         allow_unseen=given.allow_unseen,
         arrival=error,
         known=KnownFloor(maps, keep_out) if maps or keep_out else None,

@@ -63,7 +63,7 @@ def serve(given: ServeOptions) -> None:
     """Answer requests for base poses: a frame in, an answer out; frames of a session are fused.
 
     POST /base takes an .npz with rgb, depth, intrinsics and optionally mask and T_world_camera as its body,
-    and click, session, arrival, allow_unseen, camera_height and candidates as its query. /docs lists all.
+    and click or box, session, arrival, allow_unseen, camera_height, candidates as its query. /docs lists all.
 
     For example: datagen serve --robot fetch --map map.yaml
     """

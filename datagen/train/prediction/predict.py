@@ -25,6 +25,7 @@ from datagen.train.prediction.base_cells import (
     choose,
     observe_cells,
 )
+from datagen.train.prediction.boxes import Box, box_mask
 from datagen.train.prediction.frames import SensorFrame, image_frame
 from datagen.train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
 from datagen.train.prediction.ground import Ground, find_ground
@@ -75,6 +76,7 @@ def predict(
     camera_height_m: float | None = None,
     gravity: F64 | None = None,
     click: tuple[int, int] | None = None,
+    box: Box | None = None,
     target_center_m: F64 | None = None,
     allow_unseen: bool = False,
     arrival: Arrival | None = None,
@@ -87,7 +89,7 @@ def predict(
 
     Several frames need a pose each. `camera_height_m` is that of the camera that took the frame; with
     `gravity` (3,), in its frame, or the floor in sight it gives the pose of a frame that has none.
-    The target is given by masks, by one click into the first frame, or by a cloud's own marks;
+    The target is given by masks, by one click or a box in the first frame, or by a cloud's own marks;
     `target_center_m` (3,), world, replaces the estimated centre. With an `arrival` error the best is the cell
     with the highest expected success. A map of the floor that is `known` is in the frame of the poses of the
     frames. InputError where arguments are missing or invalid.
@@ -99,7 +101,7 @@ def predict(
         fix = "Give its frames T_world_camera in the map: pose.json in a folder, or in the .npz"
         raise InputError("--map", "", "says nothing of frames without a pose", fix)
     grounds = _grounds(frames, camera_height_m, gravity)
-    frames = _with_target(frames, grounds, click)
+    frames = _with_target(frames, grounds, click, box)
     prepared, filled = _fill(frames)
     poses = [ground.T_world_camera for ground in grounds]
     seen = fuse(prepared, poses)
@@ -153,22 +155,32 @@ def _grounds(
 
 
 def _with_target(
-    frames: Sequence[SensorFrame], grounds: Sequence[Ground], click: tuple[int, int] | None
+    frames: Sequence[SensorFrame], grounds: Sequence[Ground], click: tuple[int, int] | None, box: Box | None
 ) -> list[SensorFrame]:
-    """The frames, the first with the mask of the clicked object."""
+    """The frames, the first with the mask of the object that was clicked or boxed."""
     first, image = frames[0], frames[0].image
+    if click is None and box is None:
+        if not any(frame.on_target is not None for frame in frames):
+            fix = (
+                "Give --click u,v, --box, or a mask (in a .ply: a vertex property `target`, 1 on the target)"
+            )
+            raise InputError(first.place, "target", "is not marked", fix)
+        return list(frames)
+    if click is not None and box is not None:
+        raise InputError("--box", "", "is given with --click", "Give one of them")
+    option = "--box" if click is None else "--click"
+    if image is None:
+        raise InputError(option, "", "needs an image, not a cloud", "Give a frame with an image first")
+    if image.mask is not None:
+        raise InputError(option, "", "is given for a frame with a mask", f"Omit {option}, or the mask")
+    T = grounds[0].T_world_camera
     if click is not None:
-        if image is None:
-            raise InputError("--click", "", "needs an image, not a cloud", "Give a frame with an image first")
-        if image.mask is not None:
-            raise InputError("--click", "", "is given for a frame with a mask", "Omit --click, or the mask")
-        grown = replace(image, mask=grow_mask(image, click, grounds[0].T_world_camera))
-        clicked = image_frame(grown, first.T_world_camera, {"depth": first.place, "mask": "--click"})
-        return [clicked, *frames[1:]]
-    if not any(frame.on_target is not None for frame in frames):
-        fix = "Give --click u,v, or a mask (in a .ply: a vertex property `target`, 1 on the target)"
-        raise InputError(first.place, "target", "is not marked", fix)
-    return list(frames)
+        mask = grow_mask(image, click, T)
+    else:
+        assert box is not None
+        mask = box_mask(image, box, T)
+    where = {"depth": first.place, "mask": option}
+    return [image_frame(replace(image, mask=mask), first.T_world_camera, where), *frames[1:]]
 
 
 def _fill(frames: Sequence[SensorFrame]) -> tuple[list[SensorFrame], Filled | None]:

@@ -17,6 +17,7 @@ _RAN_OUT, _ROUNDS = 0.95, 4
 _FEW_FAR = 0.01  # share of the region's pixels that may be that far
 _SUPPORT_AREA_M2 = 0.004  # a smaller level surface is no support
 _BIN_M = 0.004
+_LARGEST_M = 0.45  # a larger region is furniture, or several objects
 
 
 def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> Bools:
@@ -34,7 +35,7 @@ def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> 
     depth_m = image.depth_m
     if depth_m[v, u] == 0:
         near = (depth_m[max(v - 15, 0) : v + 16, max(u - 15, 0) : u + 16] > 0).any()
-        fix = "Give another pixel of the target" if near else "Take the frame again, or give its mask"
+        fix = "Give another pixel of the target" if near else "Take the frame again, or give its box or mask"
         raise InputError("--click", f"{click[0]},{click[1]}", "has no depth", fix)
     # Pixels outside the window are farther than `_GROWS_M` from the point.
     around_px = max(image.pinhole.fx_px, image.pinhole.fy_px) * _GROWS_M / max(depth_m[v, u] - _GROWS_M, 0.1)
@@ -53,14 +54,14 @@ def _grown(image: RgbdImage, click: tuple[int, int], T_world_camera: F64, pixel:
     seed = grid[v, u]
     far_m = np.linalg.norm(grid - seed, axis=2)
     around = (depth_m > 0) & (far_m < _GROWS_M)
-    joined = ~_breaks(depth_m) | _disc((h, w), (u, v), 2)
+    joined = ~depth_breaks(depth_m) | _disc((h, w), (u, v), 2)
     level = around & (grid[..., 2] < seed[2] - 0.003)
     allowed = grown = np.zeros((h, w), np.bool_)
     # Whether the object is off the floor and above its support, and ends within `_GROWS_M`.
     on_floor = bool(floor_points(seed[None], T_world_camera[:3, 3])[0])
     stands_out = not on_floor
     for k in range(_ROUNDS):
-        lowest_m = _above_support(grid, facets, level, seed)
+        lowest_m = above_support(grid, facets, level, seed)
         stands_out &= k > 0 or seed[2] > lowest_m
         allowed = around & (grid[..., 2] > min(lowest_m, seed[2] - 1e-4))
         labels = np.zeros((h, w), np.int64)
@@ -74,16 +75,26 @@ def _grown(image: RgbdImage, click: tuple[int, int], T_world_camera: F64, pixel:
     if not stands_out:
         refuse_surface(grid, facets, depth_m, joined, click, pixel, _GROWS_M)
     if on_floor:
-        fix = "Click higher on the target, or give its mask"
+        fix = "Click higher on the target, or give its box or mask"
         raise InputError("--click", f"{pixel[0]},{pixel[1]}", "lies on the floor", fix)
     grown[v, u] = True
-    # Rim pixels that `_breaks` left out are the target's where they are as near as the target next to them.
+    # Rim pixels without a label are the target's where they are as near as the target next to them.
     rim = np.asarray(ndimage.binary_dilation(grown, iterations=2), np.bool_) & allowed
     step_m = np.abs(depth_m - from_nearest(depth_m, grown))
     filled = np.asarray(ndimage.binary_fill_holes(grown | (rim & (step_m < _step_m(depth_m)))), np.bool_)
     mask = filled & (depth_m > 0)
     _refuse_spread(grid, mask, far_m, pixel)
+    refuse_large(grid[mask], "--click", f"{pixel[0]},{pixel[1]}")
     return mask
+
+
+def refuse_large(points_m: F64, option: str, value: str) -> None:
+    """Raise InputError where a mask's world points (N, 3) are those of furniture or of several objects."""
+    low, high = np.percentile(points_m, (2, 98), axis=0)
+    wide_m, tall_m = float(np.hypot(*(high - low)[:2])), float((high - low)[2])
+    if max(wide_m, tall_m) > _LARGEST_M:
+        problem = f"selects a region {wide_m:.2f} m wide and {tall_m:.2f} m high, more than a hand can grasp"
+        raise InputError(option, value, problem, "Give a narrower --box around the target, or its mask")
 
 
 def _refuse_spread(grid: F64, mask: Bools, far_m: F64, pixel: tuple[int, int]) -> None:
@@ -95,11 +106,11 @@ def _refuse_spread(grid: F64, mask: Bools, far_m: F64, pixel: tuple[int, int]) -
     if far > _FEW_FAR * len(points):
         problem = f"grows into its surroundings: a region {size}, {points[:, 2].mean():.2f} m above the floor"
         raise InputError(
-            "--click", f"{pixel[0]},{pixel[1]}", problem, "Click on another pixel, or give its mask"
+            "--click", f"{pixel[0]},{pixel[1]}", problem, "Click on another pixel, or give its box or mask"
         )
 
 
-def _above_support(grid: F64, facets: F64, among: Bools, seed: F64) -> float:
+def above_support(grid: F64, facets: F64, among: Bools, seed: F64) -> float:
     """Height above which points belong to objects on the widest level surface `among` pixels (H, W)."""
     areas = np.linalg.norm(facets, axis=2)
     rows = among & (facets[..., 2] > 0.9 * areas) & (areas > 0)
@@ -123,7 +134,7 @@ def _step_m(depth_m: F32) -> F64:
     return 0.008 + 3 * depth_error_m(depth_m)
 
 
-def _breaks(depth_m: F32) -> Bools:
+def depth_breaks(depth_m: F32) -> Bools:
     """Pixels (H, W) at a jump in depth that slope does not explain, or next to missing depth."""
     smooth = ndimage.median_filter(depth_m, 3)
     breaks = np.zeros(depth_m.shape, np.bool_)
@@ -152,7 +163,7 @@ _FAR_SHARE, _LEAST_SECTORS = 0.8, 3
 _LEAST_FILLED = 0.5  # share of such a sector's ring that the plane fills
 _LEVEL, _UPRIGHT = 0.9, 0.3  # limits of the normal's z
 _ON_FLOOR_M = 0.04
-_FIX = "Click on the target itself, or give its mask"
+_FIX = "Click on the target itself, or give its box or mask"
 
 
 def refuse_surface(

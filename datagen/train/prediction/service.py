@@ -86,6 +86,7 @@ def make_app(workers: WorkerProcesses, model: str, token: str | None) -> FastAPI
         request: Request,
         session: Annotated[str | None, Query(pattern=r"^[\w.-]{1,64}$")] = None,
         click: Annotated[str | None, Query(pattern=r"^[0-9]{1,6},[0-9]{1,6}$")] = None,
+        box: Annotated[str | None, Query(pattern=r"^[0-9]{1,6}(,[0-9]{1,6}){3}$")] = None,
         arrival: Annotated[str | None, Query(max_length=60, pattern=r"^(nav2$|normal:|disc:)")] = None,
         allow_unseen: bool = False,
         camera_height: Annotated[float | None, Query(gt=0, le=10)] = None,
@@ -99,6 +100,7 @@ def make_app(workers: WorkerProcesses, model: str, token: str | None) -> FastAPI
                 raise HTTPException(413, f"the body has more than {MOST_BYTES >> 20} MiB")
         options = {
             "click": None if click is None else tuple(map(int, click.split(","))),
+            "box": None if box is None else tuple(map(int, box.split(","))),
             "arrival": arrival,
             "allow_unseen": allow_unseen,
             "camera_height": camera_height,

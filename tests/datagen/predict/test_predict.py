@@ -80,20 +80,24 @@ def test_a_click_and_the_same_frame_as_folder_archive_and_cloud(
         "folder": ["--frame", str(frame)],
         "npz": ["--frame", str(tmp_path / "a.npz")],
         "ply": ["--frame", str(tmp_path / "a.ply"), *level],
-        "click": ["--frame", frame_with(frame, tmp_path, mask=None)],
     }
+    unmarked = frame_with(frame, tmp_path, mask=None)
     middle = np.argmin((v - np.nonzero(mask)[0].mean()) ** 2 + (u - np.nonzero(mask)[1].mean()) ** 2)
-    answers["click"] += ["--click", f"{u[middle]},{v[middle]}"]
+    answers["click"] = ["--frame", unmarked, "--click", f"{u[middle]},{v[middle]}"]
+    rows, columns = np.nonzero(mask)
+    box = columns.min() - 2, rows.min() - 2, columns.max() + 3, rows.max() + 3
+    answers["box"] = ["--frame", unmarked, "--box", ",".join(map(str, box))]
     found = {name: json_of(capsys, ["predict", checkpoint, *given, *rest]) for name, given in answers.items()}
     whole, cloud = found["folder"], found.pop("ply")
     assert cloud["target"]["center_m"][2] == pytest.approx(whole["target"]["center_m"][2], abs=1e-5)
     for name, answer in found.items():
         gap = np.subtract(answer["target"]["center_m"], whole["target"]["center_m"])
-        assert np.linalg.norm(gap) < (0.01 if name == "click" else 1e-5), name
+        assert np.linalg.norm(gap) < (0.01 if name in ("click", "box") else 1e-5), name
     ours, theirs = ([c["score"] for c in a["candidates"]] for a in (found["npz"], whole))
     np.testing.assert_allclose(ours, theirs, atol=1e-4)
     assert np.ptp(theirs) > 0.1
-    assert found["click"]["target"]["mask_pixels"] == pytest.approx(mask.sum(), rel=0.15)
+    for name in ("click", "box"):
+        assert found[name]["target"]["mask_pixels"] == pytest.approx(mask.sum(), rel=0.15), name
 
 
 def test_a_frame_as_robots_and_data_sets_have_it(

@@ -155,6 +155,8 @@ REFUSED: list[tuple[str, str, str]] = [
     ("--gravity", "0,nan,1", "--gravity"),
     ("--gravity", "0,-9.8,0", "sign"),
     ("--click", "10,10", "is given for a frame with a mask"),
+    ("--box", "10,10,30,30", "is given for a frame with a mask"),
+    ("--box", "10,10,30", "is no box"),
     ("--frame", "{bad}/missing", "--frame"),
     ("--frame", "{bad}/none.ply", "no vertices"),
     ("--frame", "{bad}/many.ply", "1,000,000,000,000"),

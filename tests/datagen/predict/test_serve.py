@@ -72,6 +72,8 @@ def test_frames_of_a_session_are_fused_and_bounded(client: TestClient, seen: See
         (b"PK\x05\x06" + bytes(18), {}, 422, "has none of"),
         (None, {"click": "1"}, 422, "click"),
         (None, {"click": "1,1"}, 422, "--click"),
+        (None, {"box": "1,1,9"}, 422, "box"),
+        (None, {"box": "1,1,9,9"}, 422, "--box"),
         (None, {"session": "../x"}, 422, "session"),
         (None, {"arrival": "/etc/passwd"}, 422, "arrival"),
         (None, {"arrival": "normal:x"}, 422, "--arrival"),
