@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from hashlib import sha256
 from typing import NamedTuple
 
 import numpy as np
 
+from datagen.workers.content_cache import CacheFolder
 from datagen.workers.geometry.mesh import F32, F64, I32
-from datagen.workers.kinematics.compiler import compiled, in_memory, struct
+from datagen.workers.kinematics.compiler import code_folder, compiled, in_memory, struct
 from datagen.workers.kinematics.inverse import joint_poses, one_turn, tcp_pose
 from datagen.workers.kinematics.tree import Ints, KinematicTree
 from datagen.workers.motion.reach_cells import AZIMUTHS, DIRECTIONS, DISTANCES, HEIGHTS, ROLLS, SIDES
@@ -23,6 +25,7 @@ _SAMPLES = 1 << 19  # joint vectors of a map
 _FIRST_SAMPLES = 1 << 14  # those that decide how far it extends
 _DIGITS = 6  # of an arm's numbers, in units of its length: scaled copies of an arm share samples
 _MAPS_KEPT = 16
+_MAPS = CacheFolder("reach-maps", most_files=32)  # about 17 MB each
 _APART = 1.0  # seeds with all coordinates nearer than this often lead to one solution
 _MOST_NEAR = 24  # samples among which seeds are chosen
 
@@ -227,7 +230,13 @@ def reach_map(tree: KinematicTree, draw: int = 0) -> ReachMap:
     one = _in_units(tree, length_m, unit)
     key = (*(a.tobytes() for a in one), turn, draw)
     if key not in _known:
-        _known[key] = _samples(one, turn, _rounded(axis_xy_m / length_m), draw)
+        kept = sha256(repr((code_folder().name, np.__version__, _SAMPLES, _FIRST_SAMPLES, key)).encode())
+        if (stored := _MAPS.load(kept.hexdigest())) is None:
+            cell, q, half = _samples(one, turn, _rounded(axis_xy_m / length_m), draw)
+            _MAPS.store(kept.hexdigest(), stored := {"cell": cell, "q": q, "half": np.array(half)})
+        count = DISTANCES * HEIGHTS * DIRECTIONS * ROLLS * (1 if turn >= 0 else AZIMUTHS)
+        first = np.append(0, np.cumsum(np.bincount(stored["cell"], minlength=count))).astype(np.int32)
+        _known[key] = first, stored["q"], float(stored["half"]), _near(first)
     _known.move_to_end(key)
     if len(_known) > _MAPS_KEPT:
         _known.popitem(last=False)
@@ -260,21 +269,27 @@ def _in_units(tree: KinematicTree, length_m: float, unit: F64) -> KinematicTree:
     )
 
 
-def _samples(one: KinematicTree, turn: int, axis_xy: F64, draw: int) -> tuple[I32, F32, float, I32]:
-    """First rows of the cells (C + 1,), joint vectors (N, A), half the map's width, samples near the cells (C,)."""
+def _samples(one: KinematicTree, turn: int, axis_xy: F64, draw: int) -> tuple[I32, F32, float]:
+    """Cells (N,) in their order, joint vectors (N, A), half the map's width, in the tree's units."""
     rng = np.random.Generator(np.random.PCG64(draw))
     low, high = np.transpose([one_turn(*limits) for limits in zip(one.lower, one.upper, strict=True)])
     q = rng.uniform(low, high, (_SAMPLES, len(low)))
     cell, features = np.empty(len(q), np.int64), np.empty((len(q), 8))
-    reach = ReachMap(np.zeros(1, np.int32), q[:0].astype(np.float32), axis_xy, turn, np.zeros(3), 1.0, cell[:0].astype(np.int32))
+    reach = ReachMap(
+        np.zeros(1, np.int32),
+        q[:0].astype(np.float32),
+        axis_xy,
+        turn,
+        np.zeros(3),
+        1.0,
+        cell[:0].astype(np.int32),
+    )
     tree, some = in_memory(one), q[:_FIRST_SAMPLES].copy()
     _fill(in_memory(reach), tree, some, cell[: len(some)], features)
     half = 1.02 * float(np.abs(features[: len(some), :2]).max())
     _fill(in_memory(reach._replace(half_m=half)), tree, q, cell, features)
     order = np.argsort(cell, kind="stable")
-    count = DISTANCES * HEIGHTS * DIRECTIONS * ROLLS * (1 if turn >= 0 else AZIMUTHS)
-    first = np.searchsorted(cell[order], np.arange(count + 1)).astype(np.int32)
-    return first, q[order].astype(np.float32), half, _near(first)
+    return cell[order].astype(np.int32), q[order].astype(np.float32), half
 
 
 def _near(first: I32) -> I32:

@@ -152,10 +152,10 @@ def try_pose(s: Search, poses: Poses, row: int) -> tuple[int, int]:
 
 @compiled
 def try_until(s: Search, poses: Poses, rows: Ints, start: int, most: int, reached: Ints) -> tuple[int, int]:
-    """Try these rows of the poses from `start` on, until one has a path, straight or not, or none can have one.
+    """Try these rows of the poses from `start` on, at most `most` free ones, until one could have a path.
 
-    At most `most` free poses are tried. `reached` (len(rows),) gets their stages. Returns the end of those
-    tried, and the tucked pose of the last.
+    It also ends where no tucked pose is free. Returns the end of the rows tried, whose stages `reached`
+    (len(rows),) gets, and the tucked pose of the last.
     """
     n, home = start, NO_HOME
     while n < len(rows) and most > 0:
