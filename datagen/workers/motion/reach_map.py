@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from datagen.workers.content_cache import CacheFolder
+from datagen.workers.content_cache import Arrays, CacheFolder
 from datagen.workers.geometry.mesh import F32, F64, I32
 from datagen.workers.kinematics.compiler import code_folder, compiled, in_memory, struct
 from datagen.workers.kinematics.inverse import joint_poses, one_turn, tcp_pose
@@ -231,9 +231,10 @@ def reach_map(tree: KinematicTree, draw: int = 0) -> ReachMap:
     key = (*(a.tobytes() for a in one), turn, draw)
     if key not in _known:
         kept = sha256(repr((code_folder().name, np.__version__, _SAMPLES, _FIRST_SAMPLES, key)).encode())
-        if (stored := _MAPS.load(kept.hexdigest())) is None:
-            cell, q, half = _samples(one, turn, _rounded(axis_xy_m / length_m), draw)
-            _MAPS.store(kept.hexdigest(), stored := {"cell": cell, "q": q, "half": np.array(half)})
+        stored = _MAPS.load(kept.hexdigest())
+        if stored is None:
+            stored = _samples(one, turn, _rounded(axis_xy_m / length_m), draw)
+            _MAPS.store(kept.hexdigest(), stored)
         count = DISTANCES * HEIGHTS * DIRECTIONS * ROLLS * (1 if turn >= 0 else AZIMUTHS)
         first = np.append(0, np.cumsum(np.bincount(stored["cell"], minlength=count))).astype(np.int32)
         _known[key] = first, stored["q"], float(stored["half"]), _near(first)
@@ -269,8 +270,8 @@ def _in_units(tree: KinematicTree, length_m: float, unit: F64) -> KinematicTree:
     )
 
 
-def _samples(one: KinematicTree, turn: int, axis_xy: F64, draw: int) -> tuple[I32, F32, float]:
-    """Cells (N,) in their order, joint vectors (N, A), half the map's width, in the tree's units."""
+def _samples(one: KinematicTree, turn: int, axis_xy: F64, draw: int) -> Arrays:
+    """Cells (N,) in their order, joint vectors `q` (N, A), half the map's width, in the tree's units."""
     rng = np.random.Generator(np.random.PCG64(draw))
     low, high = np.transpose([one_turn(*limits) for limits in zip(one.lower, one.upper, strict=True)])
     q = rng.uniform(low, high, (_SAMPLES, len(low)))
@@ -289,7 +290,7 @@ def _samples(one: KinematicTree, turn: int, axis_xy: F64, draw: int) -> tuple[I3
     half = 1.02 * float(np.abs(features[: len(some), :2]).max())
     _fill(in_memory(reach._replace(half_m=half)), tree, q, cell, features)
     order = np.argsort(cell, kind="stable")
-    return cell[order].astype(np.int32), q[order].astype(np.float32), half
+    return {"cell": cell[order].astype(np.int32), "q": q[order].astype(np.float32), "half": np.array(half)}
 
 
 def _near(first: I32) -> I32:
