@@ -11,6 +11,8 @@ import stat
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +71,15 @@ class CacheFolder:
 
     def _path(self, key: str) -> Path:
         return cache_folder() / self.folder / f"{key}.npz"
+
+
+@cache
+def version_of(package: str) -> str:
+    """The version of an installed package, for keys of what it computes."""
+    try:
+        return version(package)
+    except PackageNotFoundError:  # installed without metadata, as conda packages can be
+        return ""
 
 
 def refresh(path: Path) -> None:

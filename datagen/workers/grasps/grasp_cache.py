@@ -6,8 +6,6 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
@@ -15,7 +13,7 @@ import numpy.typing as npt
 
 from datagen.schemas.identity import digest_of
 from datagen.schemas.specification import GraspParams
-from datagen.workers.content_cache import CacheFolder
+from datagen.workers.content_cache import CacheFolder, version_of
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.grasps.search import BLOCK, VERSION, HandPoses, hand_poses_of, score_block, score_poses
 from datagen.workers.objects.model import ObjectModel
@@ -203,7 +201,7 @@ def _known(digest: str) -> _Known:
 
 def _poses(known: _Known, digest: str, model: ObjectModel, gripper: Gripper, search: int) -> HandPoses:
     if search == len(known.searches):
-        key = _file_digest([digest, search])
+        key = file_digest([digest, search])
         stored = _POSES.load(key)
         if stored is None:
             stored = vars(hand_poses_of(model, gripper, _generator([digest, search])))
@@ -215,7 +213,7 @@ def _poses(known: _Known, digest: str, model: ObjectModel, gripper: Gripper, sea
 def _score(known: _Known, digest: str, model: ObjectModel, gripper: Gripper, search: int, block: int) -> F32:
     if (search, block) not in known.scores:
         poses = known.searches[search]
-        key = _file_digest([digest, search, block])
+        key = file_digest([digest, search, block])
         stored = _SCORES.load(key)
         if stored is None:
             rng = _generator([digest, search, block])
@@ -237,14 +235,6 @@ def _parts_digest(parts_m: Parts) -> str:
     return hasher.hexdigest()
 
 
-def _file_digest(key: list[Any]) -> str:
+def file_digest(key: list[Any]) -> str:
     """File name that includes the engines' versions: results of other versions are not read."""
-    return digest_of([*key, *map(_version_of, _ENGINES)])
-
-
-@cache
-def _version_of(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:  # installed without metadata, as conda packages can be
-        return ""
+    return digest_of([*key, *map(version_of, _ENGINES)])

@@ -62,7 +62,7 @@ struct(Still)
 class Scratch(NamedTuple):
     """Arrays that checks of P moving and F still parts write into."""
 
-    W: F64  # (4, 3)
+    W: F64  # (11, 3)
     v: F64  # (3,)
     axes: F64  # (P, F, 3), a direction between each moving and each still part
     center_m: F64  # (P, 3), of the moving parts' boxes
@@ -78,7 +78,7 @@ new_scratch = struct(Scratch)
 def scratch_of(moving: int, still: int) -> Scratch:
     """Arrays for checks of numbers of moving and of still parts."""
     return new_scratch(
-        np.empty((4, 3)),
+        np.empty((11, 3)),
         np.empty(3),
         np.zeros((moving, still, 3)),
         np.empty((moving, 3)),
@@ -232,11 +232,12 @@ def hits_itself(parts: Parts, pairs: Ints, T: F64, axes: F64, s: Scratch) -> boo
 
 @compiled
 def touching_pairs(parts: Parts, pairs: Ints, T: F64, s: Scratch, out: Bools) -> None:
-    """Which pairs (K, 2) of the parts touch, into out (K,), their owners posed by T (O, 3, 4)."""
+    """Which pairs (K, 2) of the parts touch, into out (N, K), their owners posed by T (N, O, 3, 4)."""
     axis = np.empty(3)
-    for k in range(len(pairs)):
-        axis[0] = axis[1] = axis[2] = 0.0
-        out[k] = _pair_touches(parts, pairs[k, 0], pairs[k, 1], T, axis, s)
+    for n in range(len(T)):
+        for k in range(len(pairs)):
+            axis[0] = axis[1] = axis[2] = 0.0
+            out[n, k] = _pair_touches(parts, pairs[k, 0], pairs[k, 1], T[n], axis, s)
 
 
 @compiled

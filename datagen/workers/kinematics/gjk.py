@@ -16,10 +16,10 @@ _TOUCHING = 1e-20  # squared distance (m^2) that counts as none
 
 @compiled
 def _closest(W: F64, n: int, v: F64) -> int:
-    """Reduce a simplex of n points W (4, 3) to the face nearest to the origin; v is the nearest point.
+    """Reduce a simplex of n points W (11, 3) to the face nearest to the origin; v is the nearest point.
 
     Returns the number of points kept; 4 where the origin is inside. By regions of Voronoi (Ericson 2005,
-    chapter 5.1), in the order of the points.
+    chapter 5.1), in the order of the points. Rows 4 and more of W are scratch.
     """
     if n == 1:
         v[0], v[1], v[2] = W[0, 0], W[0, 1], W[0, 2]
@@ -30,8 +30,7 @@ def _closest(W: F64, n: int, v: F64) -> int:
         return _closest_triangle(W, v)
     # A tetrahedron: the nearest of the faces that the origin lies outside of.
     best = np.inf
-    kept, count = np.empty((3, 3)), 0
-    face, u = np.empty((4, 3)), np.empty(3)
+    kept, face, u, count = W[4:7], W[7:10], W[10], 0
     is_outside = False
     for k in range(4):  # the face without point k
         rows = 0
@@ -134,7 +133,7 @@ def gap_m(A: F64, T: F64, B: F64, near_m: float, far_m: float, axis: F64, W: F64
     """Distance of the hulls of A (Va, 3), moved by the pose T (3, 4), and of B (Vb, 3).
 
     It stops early: a result of at most `near_m` is an upper bound, one above `far_m` a lower bound. `axis`
-    (3,) is a direction from B to A to begin with, and is set to the last one; zeros are allowed. `W` (4, 3)
+    (3,) is a direction from B to A to begin with, and is set to the last one; zeros are allowed. `W` (11, 3)
     and `v` (3,) are scratch.
     """
     v[0], v[1], v[2] = axis[0], axis[1], axis[2]

@@ -35,6 +35,7 @@ class IkWork(NamedTuple):
     normal: F64  # (6, 6)
     twist: F64  # (6,)
     step: F64  # (A,)
+    scratch: F64  # (5, 3)
 
 
 new_ik_work = struct(IkWork)
@@ -110,10 +111,12 @@ def tcp_pose(tree: KinematicTree, T_root: F64, joints: F64, out: F64) -> None:
 
 
 @compiled
-def pose_error(T: F64, goal: F64, out: F64) -> None:
-    """Twist (6,) in the frame T that leads to the goal: position, then rotation (logarithm of SE(3))."""
-    R = np.empty((3, 3))
-    p = np.empty(3)
+def pose_error(T: F64, goal: F64, out: F64, scratch: F64) -> None:
+    """Twist (6,) in the frame T that leads to the goal: position, then rotation (logarithm of SE(3)).
+
+    `scratch` is (5, 3).
+    """
+    R, p = scratch[:3], scratch[3]  # new arrays would cost as much as the numbers in them
     for i in range(3):
         p[i] = 0.0
         for k in range(3):
@@ -130,7 +133,7 @@ def pose_error(T: F64, goal: F64, out: F64) -> None:
             if R[i, i] > R[k, k]:
                 k = i
         n = math.sqrt((R[k, k] + 1) / 2)
-        w = np.empty(3)
+        w = scratch[4]
         for i in range(3):
             w[i] = angle * (n if i == k else (R[i, k] + R[k, i]) / (4 * n))
         wx, wy, wz = w[0], w[1], w[2]
@@ -222,7 +225,7 @@ def solve(tree: KinematicTree, T_root: F64, goal: F64, q: F64, work: IkWork) -> 
     for step in range(_MAX_STEPS):
         joint_poses(tree, T_root, q, joints)
         tcp_pose(tree, T_root, joints, T)
-        pose_error(T, goal, e)
+        pose_error(T, goal, e, work.scratch)
         distance = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
         angle = e[3] * e[3] + e[4] * e[4] + e[5] * e[5]
         if distance < POSITION_TOLERANCE_M**2 and angle < ANGLE_TOLERANCE_RAD**2:
@@ -262,6 +265,7 @@ def ik_workspace(tree: KinematicTree) -> IkWork:
         np.empty((6, 6)),
         np.empty(6),
         np.empty(len(tree.lower)),
+        np.empty((5, 3)),
     )
 
 

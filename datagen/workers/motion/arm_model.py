@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
@@ -89,10 +90,15 @@ def hand_of(gripper: Gripper, opening_m: F64) -> Hand:
     posture = gripper.posture(opening_m)
     sides = [0] * len(gripper.palm_parts_m)
     sides += [s for s, parts in zip((1, -1), gripper.fingers_in[0], strict=True) for _ in parts]
+    whole, core = (_shapes(*_slid(bodies, sides, posture, opening_m)) for bodies in _bodies(gripper))
+    return Hand(whole, core)
+
+
+@lru_cache(maxsize=8)
+def _bodies(gripper: Gripper) -> tuple[list[list[F64]], list[list[F64]]]:
+    """The hand's parts in each posture, each (V, 3), and what lies inside them."""
     bodies = [[*gripper.palm_parts_m, *left, *right] for left, right in gripper.fingers_in]
-    whole = _slid([list(map(_f64, parts)) for parts in bodies], sides, posture, opening_m)
-    core = _slid([list(map(core_of, parts)) for parts in bodies], sides, posture, opening_m)
-    return Hand(_shapes(*whole), _shapes(*core))
+    return [list(map(_f64, parts)) for parts in bodies], [list(map(core_of, parts)) for parts in bodies]
 
 
 def _shapes(points: F64, first: Ints, center: F64, half: F64) -> Parts:

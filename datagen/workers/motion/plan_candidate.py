@@ -17,6 +17,7 @@ from datagen.workers.motion.path_search import dense
 from datagen.workers.motion.planning_scene import ROOM_AROUND_M, PlanningScene
 from datagen.workers.motion.search import (
     ARM_COLLISION,
+    NO_IK,
     NO_LIFT,
     NO_START,
     NOT_FREE,
@@ -24,7 +25,7 @@ from datagen.workers.motion.search import (
     length_and_clearance,
     path_to,
     samples_near,
-    try_pose,
+    try_until,
 )
 
 STAGES = ("no_ik", "arm_collision", "no_start", "no_approach", "no_lift", "no_path", "success")
@@ -106,18 +107,16 @@ class _Search:
 
         `arrays` are the poses before they were put in memory. `stages` gets how far each came.
         """
-        end = self.tried + most
-        for k in rows.tolist():
-            if self.tried == end:
-                break
-            stage, home = try_pose(self.compiled, poses, k)
-            if stage == NOT_FREE:
-                continue
+        start, end, reached = 0, self.tried + most, np.empty(len(rows), np.int64)
+        while start < len(rows) and self.tried < end:
+            past, home = try_until(self.compiled, poses, rows, start, end - self.tried, reached)
+            free = start + np.flatnonzero(reached[start:past] != NOT_FREE)
+            found, stage, start = int(self.found[0]), int(reached[past - 1]), past
+            known = np.minimum(reached[free], SUCCESS - 1).tolist()
+            stages.update(zip(rows[free].tolist(), known, strict=True))
+            self.tried, self.furthest = self.tried + len(free), max(self.furthest, *known, NO_IK)
+            k = int(rows[past - 1])
             row, T, opening = k if of_grasps else -1, arrays.T_world_tcp[k], int(arrays.opening[k])
-            self.tried += 1
-            stages[k] = min(stage, SUCCESS - 1)
-            self.furthest = max(self.furthest, stages[k])
-            found = int(self.found[0])
             if stage == SUCCESS and self.holds(row, T, opening):
                 corners = np.stack([self.scene.robot.homes_rad[home], self.back[found, -1]])
                 path = dense(self.scene.weight, corners, self.scene.limits.step)

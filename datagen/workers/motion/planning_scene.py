@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from datagen.schemas.specification import MotionParams
 from datagen.workers.bases.clearance import STEP_M
+from datagen.workers.content_cache import CacheFolder
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.grasps.grasp_cache import GraspSet
+from datagen.workers.grasps.grasp_cache import GraspSet, content_digest, file_digest
 from datagen.workers.houses.house import House
-from datagen.workers.kinematics.compiler import in_memory
+from datagen.workers.kinematics.compiler import code_folder, in_memory
 from datagen.workers.kinematics.contacts import Parts, Still, hit_any, parts_of
 from datagen.workers.kinematics.tree import Ints
 from datagen.workers.motion.arm_model import TOUCH_M, arm_of, core_of, hand_of, on_pedestal
@@ -188,6 +190,7 @@ def hand_scene(
     )
 
 
+_CLEAR = CacheFolder("clear-poses", most_files=4096)  # about 2 KB each
 _clear: WeakKeyDictionary[GraspSet, dict[tuple[str, Limits], tuple[Hand, Ints, F64, Ints]]] = (
     WeakKeyDictionary()
 )
@@ -198,7 +201,7 @@ def _clear_poses(
 ) -> tuple[Hand, Ints, F64, Ints]:
     """The hand at the grasps' openings; grasps (K,), poses (K, 4, 4) and openings (K,) that clear the target.
 
-    Computed once per object, in its own frame: they do not depend on the scene.
+    Computed once per object, in its own frame, and cached: they do not depend on the scene.
     """
     known, key = _clear.setdefault(grasps, {}), (gripper.digest, limits)
     if key not in known:
@@ -207,10 +210,15 @@ def _clear_poses(
         grasp = np.repeat(np.arange(len(grasps)), 2)
         T = np.repeat(grasps.T_object_tcp, 2, axis=0)
         T[1::2] = T[1::2] @ _HALF_TURN
-        still = still_of(target.convex_parts_m, [int(TARGET)] * len(target.convex_parts_m))
         opening = rows[grasp].astype(np.int64)
-        room = in_memory(Room(still, np.arange(len(still.kind))))
-        ok = clear_poses(hand, room, in_memory(limits), np.ascontiguousarray(T[:, :3]), opening)
+        at = sha256(grasps.T_object_tcp.tobytes() + grasps.opening_m.tobytes()).hexdigest()
+        place = file_digest([code_folder().name, content_digest(target, gripper), [*limits], at])
+        if (stored := _CLEAR.load(place)) is None:
+            still = still_of(target.convex_parts_m, [int(TARGET)] * len(target.convex_parts_m))
+            room = in_memory(Room(still, np.arange(len(still.kind))))
+            ok = clear_poses(hand, room, in_memory(limits), np.ascontiguousarray(T[:, :3]), opening)
+            _CLEAR.store(place, stored := {"ok": ok})
+        ok = stored["ok"]
         known[key] = (hand, grasp[ok], T[ok], opening[ok])
     return known[key]
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from hashlib import sha256
 from typing import NamedTuple
 
 import numpy as np
 
+from datagen.workers.content_cache import Arrays, CacheFolder
 from datagen.workers.geometry.mesh import F32, F64, I32
-from datagen.workers.kinematics.compiler import compiled, in_memory, struct
+from datagen.workers.kinematics.compiler import code_folder, compiled, in_memory, struct
 from datagen.workers.kinematics.inverse import joint_poses, one_turn, tcp_pose
 from datagen.workers.kinematics.tree import Ints, KinematicTree
 from datagen.workers.motion.reach_cells import AZIMUTHS, DIRECTIONS, DISTANCES, HEIGHTS, ROLLS, SIDES
@@ -23,6 +25,7 @@ _SAMPLES = 1 << 19  # joint vectors of a map
 _FIRST_SAMPLES = 1 << 14  # those that decide how far it extends
 _DIGITS = 6  # of an arm's numbers, in units of its length: scaled copies of an arm share samples
 _MAPS_KEPT = 16
+_MAPS = CacheFolder("reach-maps", most_files=32)  # about 17 MB each
 _APART = 1.0  # seeds with all coordinates nearer than this often lead to one solution
 _MOST_NEAR = 24  # samples among which seeds are chosen
 
@@ -36,6 +39,7 @@ class ReachMap(NamedTuple):
     turn: int  # the coordinate that turns about it; -1 where there is none
     tcp_wrist_m: F64  # (3,), TCP frame
     half_m: float  # largest distance and height of the wrist
+    near: I32  # (C,), samples in and next to each cell: its own count eight times
 
 
 struct(ReachMap)
@@ -115,6 +119,11 @@ def _feature(reach: ReachMap, T: F64, out: F64) -> float:
 
 
 @compiled
+def _is_out(distance: float, height: float) -> bool:
+    return distance > 1 + 1 / DISTANCES or abs(height) > 1 + 2 / HEIGHTS
+
+
+@compiled
 def cells_near(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> float:
     """The cell of a TCP pose (3, 4) in the base frame and the six next to it, (7,); -1 where there is none.
 
@@ -125,7 +134,7 @@ def cells_near(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> float:
     for k in range(7):
         cells[k] = -1
     distance, height = feature[0], feature[1]
-    if distance > 1 + 1 / DISTANCES or abs(height) > 1 + 2 / HEIGHTS:
+    if _is_out(distance, height):
         return azimuth
     a, c = feature[2:5], feature[5:8]
     cells[0] = cell_of(distance, height, azimuth, a, c, turns)
@@ -148,12 +157,10 @@ def cells_near(reach: ReachMap, T: F64, cells: Ints, feature: F64) -> float:
 @compiled
 def score(reach: ReachMap, T: F64, w: ReachWork) -> int:
     """How many samples lie near a TCP pose (3, 4), base frame: those of its own cell count eight times."""
-    cells_near(reach, T, w.cells, w.feature)
-    total, first, cells = 0, reach.first, w.cells
-    for k in range(7):
-        if cells[k] >= 0:
-            total += (8 if k == 0 else 1) * (first[cells[k] + 1] - first[cells[k]])
-    return int(total)
+    azimuth, f = _feature(reach, T, w.feature), w.feature
+    if _is_out(f[0], f[1]):
+        return 0
+    return int(reach.near[cell_of(f[0], f[1], azimuth, f[2:5], f[5:8], reach.turn >= 0)])
 
 
 @compiled
@@ -223,18 +230,25 @@ def reach_map(tree: KinematicTree, draw: int = 0) -> ReachMap:
     one = _in_units(tree, length_m, unit)
     key = (*(a.tobytes() for a in one), turn, draw)
     if key not in _known:
-        _known[key] = _samples(one, turn, _rounded(axis_xy_m / length_m), draw)
+        kept = sha256(repr((code_folder().name, np.__version__, _SAMPLES, _FIRST_SAMPLES, key)).encode())
+        stored = _MAPS.load(kept.hexdigest())
+        if stored is None:
+            stored = _samples(one, turn, _rounded(axis_xy_m / length_m), draw)
+            _MAPS.store(kept.hexdigest(), stored)
+        count = DISTANCES * HEIGHTS * DIRECTIONS * ROLLS * (1 if turn >= 0 else AZIMUTHS)
+        first = np.append(0, np.cumsum(np.bincount(stored["cell"], minlength=count))).astype(np.int32)
+        _known[key] = first, stored["q"], float(stored["half"]), _near(first)
     _known.move_to_end(key)
     if len(_known) > _MAPS_KEPT:
         _known.popitem(last=False)
-    first, q, half = _known[key]
+    first, q, half, near = _known[key]
     if (unit != 1.0).any():
         q = (q * unit).astype(np.float32)
     R, t_m = tree.T_joint_frame[-1, :3, :3], tree.T_joint_frame[-1, :3, 3]
-    return ReachMap(first, q, axis_xy_m, turn, -(R.T @ t_m), half * length_m)
+    return ReachMap(first, q, axis_xy_m, turn, -(R.T @ t_m), half * length_m, near)
 
 
-_known: OrderedDict[tuple[object, ...], tuple[I32, F32, float]] = OrderedDict()
+_known: OrderedDict[tuple[object, ...], tuple[I32, F32, float, I32]] = OrderedDict()
 
 
 def _rounded(values: F64) -> F64:
@@ -256,21 +270,38 @@ def _in_units(tree: KinematicTree, length_m: float, unit: F64) -> KinematicTree:
     )
 
 
-def _samples(one: KinematicTree, turn: int, axis_xy: F64, draw: int) -> tuple[I32, F32, float]:
-    """First rows of the cells (C + 1,), joint vectors (N, A), half the map's width, in the tree's units."""
+def _samples(one: KinematicTree, turn: int, axis_xy: F64, draw: int) -> Arrays:
+    """Cells (N,) in their order, joint vectors `q` (N, A), half the map's width, in the tree's units."""
     rng = np.random.Generator(np.random.PCG64(draw))
     low, high = np.transpose([one_turn(*limits) for limits in zip(one.lower, one.upper, strict=True)])
     q = rng.uniform(low, high, (_SAMPLES, len(low)))
     cell, features = np.empty(len(q), np.int64), np.empty((len(q), 8))
-    reach = ReachMap(np.zeros(1, np.int32), q[:0].astype(np.float32), axis_xy, turn, np.zeros(3), 1.0)
+    reach = ReachMap(
+        np.zeros(1, np.int32),
+        q[:0].astype(np.float32),
+        axis_xy,
+        turn,
+        np.zeros(3),
+        1.0,
+        cell[:0].astype(np.int32),
+    )
     tree, some = in_memory(one), q[:_FIRST_SAMPLES].copy()
     _fill(in_memory(reach), tree, some, cell[: len(some)], features)
     half = 1.02 * float(np.abs(features[: len(some), :2]).max())
     _fill(in_memory(reach._replace(half_m=half)), tree, q, cell, features)
     order = np.argsort(cell, kind="stable")
-    count = DISTANCES * HEIGHTS * DIRECTIONS * ROLLS * (1 if turn >= 0 else AZIMUTHS)
-    first = np.searchsorted(cell[order], np.arange(count + 1)).astype(np.int32)
-    return first, q[order].astype(np.float32), half
+    return {"cell": cell[order].astype(np.int32), "q": q[order].astype(np.float32), "half": np.array(half)}
+
+
+def _near(first: I32) -> I32:
+    """Samples in each cell, eight times, and in those next to it in distance, height and roll (C,)."""
+    count = np.diff(first).reshape(DISTANCES, HEIGHTS, DIRECTIONS, ROLLS, -1)
+    near = 8 * count + np.roll(count, 1, axis=3) + np.roll(count, -1, axis=3)
+    near[1:] += count[:-1]
+    near[:-1] += count[1:]
+    near[:, 1:] += count[:, :-1]
+    near[:, :-1] += count[:, 1:]
+    return near.ravel()
 
 
 def _upright(tree: KinematicTree) -> tuple[int, F64]:

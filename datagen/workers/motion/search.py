@@ -151,6 +151,25 @@ def try_pose(s: Search, poses: Poses, row: int) -> tuple[int, int]:
 
 
 @compiled
+def try_until(s: Search, poses: Poses, rows: Ints, start: int, most: int, reached: Ints) -> tuple[int, int]:
+    """Try these rows of the poses from `start` on, at most `most` free ones, until one could have a path.
+
+    It also ends where no tucked pose is free. Returns the end of the rows tried, whose stages `reached`
+    (len(rows),) gets, and the tucked pose of the last.
+    """
+    n, home = start, NO_HOME
+    while n < len(rows) and most > 0:
+        stage, home = try_pose(s, poses, rows[n])
+        reached[n] = stage
+        n += 1
+        if stage != NOT_FREE:
+            most -= 1
+        if stage >= NO_PATH or stage == NO_START:
+            break
+    return n, home
+
+
+@compiled
 def path_to(
     s: Search, k: int, opening: int, iterations: int, rng: np.random.Generator
 ) -> tuple[F64, int, int]:

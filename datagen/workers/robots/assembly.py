@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from hashlib import sha256
 
 import numpy as np
@@ -119,18 +120,23 @@ def content_digest(source: RobotSource) -> str:
     return digest_of({"keys": keys, "contents": contents})
 
 
+# Scaled arms share them.
+@lru_cache(maxsize=8)
+def _arm_and_hand(source: RobotSource) -> tuple[ArmChain, Hand]:
+    tree, hand_tree = read_trees(source)
+    palm = source.keys.hand.palm or source.keys.arm.tip
+    if source.keys.hand.urdf is not None and source.keys.hand.palm is None:
+        raise source.wrong("hand.palm", "is missing", "Name the link of the hand's URDF that is mounted")
+    return ArmChain(source, tree, palm), hand_of(source, hand_tree, palm)
+
+
 def assemble(source: RobotSource, reach_m: float | None) -> Assembly:
     """Read the URDFs and assemble the robot; `reach_m` is for a robot that is scaled to its reach.
 
     Raises InputError naming the file and what is wrong in it.
     """
     keys = source.keys
-    tree, hand_tree = read_trees(source)
-    palm = keys.hand.palm or keys.arm.tip
-    if keys.hand.urdf is not None and keys.hand.palm is None:
-        raise source.wrong("hand.palm", "is missing", "Name the link of the hand's URDF that is mounted")
-    arm = ArmChain(source, tree, palm)
-    hand = hand_of(source, hand_tree, palm)
+    arm, hand = _arm_and_hand(source)
     scale, tube_m = 1.0, 0.0
     if keys.scaled is not None and reach_m is not None:
         rule = keys.scaled

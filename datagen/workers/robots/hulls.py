@@ -9,6 +9,7 @@ import io
 import itertools
 import re
 from functools import lru_cache
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
+from datagen.workers.content_cache import CacheFolder, version_of
 from datagen.workers.extras import how_to_get
 from datagen.workers.geometry.mesh import F32, F64, I32
 from datagen.workers.robots.gripper import Parts
@@ -26,6 +28,9 @@ from datagen.workers.robots.urdf import MOST, Shape
 
 # PhysX on a GPU accepts hulls of at most 64 corners, and coal is faster on fewer.
 MAX_CORNERS = 64
+# Part of the cache's keys: raise it when the same mesh gets other hulls.
+_VERSION = 1
+_CACHE = CacheFolder("link-hulls", most_files=1024)  # about 3 KB each
 _MAX_BYTES = 64 << 20
 _FIX = "Correct the file, or install its package again"
 _BOX_BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
@@ -88,7 +93,21 @@ def _solid(size_m: F64) -> F64:
 
 @lru_cache(maxsize=512)
 def mesh_hulls(path: Path, cuts_m: tuple[float, ...] = ()) -> tuple[F64, ...]:
-    """Corners (V, 3), at most `MAX_CORNERS`, of convex bodies that contain the mesh between the cuts."""
+    """Corners (V, 3), at most `MAX_CORNERS`, of convex bodies that contain the mesh between the cuts.
+
+    They are kept in the cache folder, because a reader of meshes takes a second to import.
+    """
+    content = sha256(read_regular(path, _MAX_BYTES, _FIX)).hexdigest()
+    versions = _VERSION, version_of("scipy"), version_of("trimesh")
+    key = sha256(repr((versions, content, path.suffix.lower(), cuts_m)).encode()).hexdigest()
+    if (stored := _CACHE.load(key)) is not None:
+        return tuple(np.split(stored["corners"], stored["cuts"]))
+    hulls = _hulls_of(path, cuts_m)
+    _CACHE.store(key, {"corners": np.concatenate(hulls), "cuts": np.cumsum([*map(len, hulls)])[:-1]})
+    return hulls
+
+
+def _hulls_of(path: Path, cuts_m: tuple[float, ...]) -> tuple[F64, ...]:
     points, edges = read_points(path)
     bounds = (-np.inf, *cuts_m, np.inf)
     try:

@@ -38,12 +38,10 @@ class SelfCollision:
         self._scratch = own_scratch(self._compiled)
         pairs = _part_pairs(self.parts, rows)
         link = self.parts.owner[pairs]  # (K, 2)
-        count, touches = dict.fromkeys(rows, 0), np.empty(len(pairs), np.bool_)
-        rng = np.random.Generator(np.random.PCG64(0))
-        for q in rng.uniform(tree.lower, tree.upper, (_SAMPLES, len(tree.lower))):
-            touching_pairs(self._compiled, pairs, poses(q), self._scratch, touches)
-            for a, b in set(map(tuple, link[touches].tolist())):
-                count[a, b] += 1
+        rng, touches = np.random.Generator(np.random.PCG64(0)), np.empty((_SAMPLES, len(pairs)), np.bool_)
+        T = np.stack([poses(q) for q in rng.uniform(tree.lower, tree.upper, (_SAMPLES, len(tree.lower)))])
+        touching_pairs(self._compiled, pairs, T, self._scratch, touches)
+        count = {pair: int(touches[:, (link == pair).all(axis=1)].any(axis=1).sum()) for pair in rows}
         self.pairs = tuple(pair for pair in rows if count[pair] <= _MOST * _SAMPLES)  # of links
         self.part_pairs = _part_pairs(self.parts, self.pairs)  # (K, 2)
         self._axes = np.zeros((len(self.part_pairs), 3))

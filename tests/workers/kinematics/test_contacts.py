@@ -36,7 +36,7 @@ NEAR_ONE = 1e-5  # m; coal's distances are exact to a millionth
 
 
 def gap(A: F64, T: F64, B: F64, axis: F64, near_m: float = 0.0, far_m: float = np.inf) -> float:
-    return gap_m(A, np.ascontiguousarray(T[:3]), B, near_m, far_m, axis, np.empty((4, 3)), np.empty(3))
+    return gap_m(A, np.ascontiguousarray(T[:3]), B, near_m, far_m, axis, np.empty((11, 3)), np.empty(3))
 
 
 def points(kind: str, rng: np.random.Generator) -> F64:
@@ -206,14 +206,14 @@ def test_a_robot_touches_itself_where_coal_says_so(case: tuple[str, float | None
     pairs = np.array([(a, b) for a in range(len(links)) for b in range(a) if links[a] != links[b]], np.int64)
     compiled = in_memory(parts)
     hulls = [Hulls([parts.points_m[a:b]]) for a, b in zip(parts.first, parts.first[1:], strict=False)]
-    scratch, found = own_scratch(compiled), np.empty(len(pairs), np.bool_)
+    scratch, touch = own_scratch(compiled), np.empty((1, len(pairs)), np.bool_)
     watched = {(a, b) for a, b in own.part_pairs.tolist()}
     for _ in range(6):
         q = random_coordinates(robot.tree, rng)
         T = oracle.frames(q)
-        touching_pairs(compiled, pairs, np.ascontiguousarray(T[:, :3]), scratch, found)
+        touching_pairs(compiled, pairs, np.ascontiguousarray(T[None, :, :3]), scratch, touch)
         gaps = np.array([hulls[a].gaps_m(T[links[a]], hulls[b], T[links[b]], 0.0)[0, 0] for a, b in pairs])
-        assert (found == (gaps < 0.0))[np.abs(gaps) > 1e-9].all()
+        assert (touch[0] == (gaps < 0.0))[np.abs(gaps) > 1e-9].all()
         hit = any((min(pair), max(pair)) in watched for pair in pairs[gaps < 0.0].tolist())
         assert robot.collides_itself(q) == hit
     assert {(int(links[a]), int(links[b])) for a, b in watched} <= set(robot.self_pairs)

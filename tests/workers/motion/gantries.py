@@ -39,7 +39,8 @@ def machine(
         np.array([2, 2]), np.stack([np.eye(4), T_hand]),
     )  # fmt: skip
     cube, none = box_vertices((CUBE_M,) * 3), parts_of([])
-    reach = ReachMap(np.zeros(2, np.int32), np.zeros((0, 3), np.float32), np.zeros(2), -1, np.zeros(3), 1.0)
+    count = np.zeros(2, np.int32)
+    reach = ReachMap(count, np.zeros((0, 3), np.float32), np.zeros(2), -1, np.zeros(3), 1.0, count)
     rows = np.array(homes, np.float64).reshape(-1, 3)
     arm = Arm(
         tree.along_z(), parts_of([[cube]]), none, none, np.zeros((0, 2), np.int64), rows, np.ones(3), reach
