@@ -74,7 +74,10 @@ def test_the_command_line_calls_the_same_functions() -> None:
 
 
 def test_registries_have_names_and_refuse_others_with_the_valid_ones() -> None:
-    assert list(datagen.houses) == ["ai2thor", "builtin", "procthor"] and len(datagen.objects) == 3
+    assert (
+        list(datagen.houses) == ["ai2thor", "builtin", "habitat", "map", "procthor"]
+        and len(datagen.objects) == 3
+    )
     assert "sim" in datagen.label_sources and "tiago" not in datagen.robots
     assert datagen.label_sources["heuristic"].name == "heuristic"
     with pytest.raises(datagen.InputError, match="Choose one of: fetch, panda, panda-scaled, pr2"):

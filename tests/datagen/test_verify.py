@@ -52,6 +52,7 @@ def test_a_run_resumed_by_newer_code_of_the_same_versions_is_sound_and_says_so(
 ) -> None:
     newer = "7" * 64
     monkeypatch.setattr("datagen.cluster.attempt.code_digest", lambda: newer)
+    monkeypatch.setattr("datagen.cluster.attempt.refuse_other_code", lambda driver: None)  # the driver's too
     made = len(Run.open(copied).committed())
     assert cli.run(["resume", str(copied), "--n", str(4 * PER_SCENE), *HERE]) == 0
     report = verified(copied, capsys, 0)

@@ -183,7 +183,9 @@ def test_frames_have_the_stored_points_in_a_folder_that_predict_reads(
         robot = ["--base-height", "0.7", "--reach", "0.9"]
         assert cli.run(["predict", "--frame", str(folder), *robot, "--json"]) in (0, 1)
         answer = json.loads(capsys.readouterr().out)
-        np.testing.assert_allclose(answer["target"]["center_m"], record["target_center_m"], atol=0.06)
+        np.testing.assert_allclose(
+            answer["target"]["center_m"], record["target_center_m"], atol=0.06 if noisy else 0.04
+        )
 
 
 def _assert_stored_points(folder: Path, line: dict[str, Any], record: Mapping[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,13 @@ def test_the_answer_is_that_of_predict(client: TestClient, seen: Seen) -> None:
     assert document["level"] == answer.level and document["best"]["index"] == answer.best
     np.testing.assert_allclose([c["score"] for c in document["candidates"]], answer.score, atol=1e-6)
     short = client.post("/base", content=packed(seen), params={"allow_unseen": True}).json()
-    assert short == {key: value for key, value in document.items() if key != "candidates"}
+    # A product of other rows may differ in its last bits.
+    del document["candidates"]
+    assert _rounded(short) == _rounded(document)
+
+
+def _rounded(document: Any) -> Any:
+    return json.loads(json.dumps(document), parse_float=lambda text: round(float(text), 6))
 
 
 def test_frames_of_a_session_are_fused_and_bounded(client: TestClient, seen: Seen) -> None:
