@@ -36,8 +36,9 @@ def test_the_chosen_scenes_are_in_one_file(
         capsys.readouterr()
         assert cli.run([*words, *more]) == 0
         assert [int(line.split()[0]) for line in capsys.readouterr().out.splitlines()[1:]] == wanted
-        clouds = [c for c in RrdReader(str(out)).stream() if c.entity_path == "/cloud"]
-        assert len(clouds) == len(wanted)
+        reader = RrdReader(str(out))
+        assert len(stores := reader.recordings()) == len(wanted)
+        assert all("/cloud" in {c.entity_path for c in reader.stream(store=store)} for store in stores)
     refused([*words, "--place", "roof"], capsys, "--place: roof", "Choose one of: floor, inside")
     refused([*words, "--outcome", "success"], capsys, "--outcome: success", "the run has none")
     refused([*words, "--object", "piano"], capsys, "no scene has all of these", "Give fewer filters")
