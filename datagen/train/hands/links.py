@@ -97,7 +97,7 @@ def _rooms(
             for each in np.unique(cloud[some]):
                 of = cloud[some] == each
                 distance_m[of] = around[each](p[of], _BEYOND_M)
-            room = (distance_m - links.radius_m * scale).min(axis=1)
+            room = (distance_m - links.radius_m * scale).min(axis=1, initial=_BEYOND_M)
             code = 1 + np.rint((room / _MOST_ROOM_M + 1).clip(0, 2) * 127).astype(np.uint8)
             found[some, stage] = np.maximum(found[some, stage], code)
     return found

@@ -81,7 +81,7 @@ def _sampled(tree: KinematicTree, radius_m: F64, arm: PoseReach) -> ArmLinks:
         way.append(parent)
     depth = np.zeros(len(tree.parent))
     depth[way[::-1]] = np.arange(1, 1 + len(way)) / len(way)
-    upright = int(tree.coordinate[next(j for j in way[::-1] if not tree.slides[j])])
+    upright = int(tree.coordinate[next((j for j in way[::-1] if not tree.slides[j]), way[0])])
     limits_rad = (float(tree.lower[upright]), float(tree.upper[upright])) if arm.turns else (-np.inf, np.inf)
     turn_rad, along = q[:, upright] - azimuth, depth[tree.frame_joint[:-1]]
     return ArmLinks(cell, wrist_m[chosen], turn_rad, centers, radius_m, along, limits_rad, arm.half_m)
