@@ -196,7 +196,9 @@ def _house(house_id: str, digest: str, known: OccupancyMap, wall_m: float, suppo
     floor = boxes(patches > 0, (-FLOOR_THICKNESS_M, 0.0), _FLOOR_RGB)
     walls = boxes((cells == OCCUPIED) & ~covered, (0.0, wall_m), _WALL_RGB)
     near = np.asarray(ndimage.distance_transform_edt(~free)) * step_m <= _UNKNOWN_M
-    hidden = boxes((cells == UNKNOWN) & ~covered & near, (0.0, wall_m), _WALL_RGB)
+    # Free cells too few for a room are no floor: a base would stand in a pocket that it cannot enter.
+    closed = ((cells == UNKNOWN) & near) | (free & (patches == 0))
+    hidden = boxes(closed & ~covered, (0.0, wall_m), _WALL_RGB)
     if not rooms or max(len(floor), len(walls) + len(hidden)) > _MAX_SOLIDS:
         problem = f"needs more than {_MAX_SOLIDS:,} boxes" if rooms else "has no free area of 1 m2"
         raise InputError(known.place, "image", problem, "Crop the map to the rooms, and remove single cells")
