@@ -152,7 +152,8 @@ def test_the_probes_hold_with_nothing_but_python(tmp_path: Path) -> None:
             time.sleep(0.5)
         (server,) = [p for p in head.children(recursive=True) if p.name() == "gcs_server"]
         server.suspend()
-        assert not results()[0]  # a head without its server is not ready
+        while results()[0]:  # a head without its server is not ready, as soon as Ray notices
+            time.sleep(0.5)
     finally:
         kill_machine(head)
         shutil.rmtree(session, ignore_errors=True)
