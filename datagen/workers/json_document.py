@@ -61,7 +61,7 @@ class JsonNode(NamedTuple):
         return float(value)
 
     def numbers(self, count: int, low: float, high: float) -> list[float]:
-        """A list of so many numbers within [low, high]."""
+        """A list of `count` numbers within [low, high]."""
         values = [item.number(low, high) for item in self.items(count)]
         if len(values) != count:
             raise self.error(f"has {len(values)} numbers, not {count}")

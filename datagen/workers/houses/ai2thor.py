@@ -22,7 +22,8 @@ from datagen.schemas.identity import digest_of
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.furniture.assets import CARRYING_TYPES
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.houses.habitat import SCENE, AssetFiles, HabitatHouses, carrying_type, sizes
+from datagen.workers.houses.habitat import SCENE, HabitatHouses, carrying_type
+from datagen.workers.houses.habitat_files import AssetFiles, sizes
 from datagen.workers.json_document import JsonNode, parse_json
 from datagen.workers.source_statement import read_statement
 

@@ -13,7 +13,6 @@ Frame of the files: right-handed, y up; world (x, y, z) = (x, -z, y). Rotations 
 from __future__ import annotations
 
 import hashlib
-import itertools
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -23,17 +22,29 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
-from datagen.schemas.safe_files import open_regular, read_regular
+from datagen.schemas.safe_files import read_regular
 from datagen.workers.furniture.asset_geometry import type_of_name
 from datagen.workers.furniture.assets import CARRYING_TYPES
 from datagen.workers.geometry.mesh import F32, F64, Mesh
 from datagen.workers.geometry.transforms import rotation_of
-from datagen.workers.houses.glb import MAX_FILE_BYTES, read_glb
+from datagen.workers.houses.glb import read_glb
 from datagen.workers.houses.habitat_checks import (
     is_about_centre,
     refuse_unfit_size,
     refuse_unfit_stage,
     refuse_upside_down,
+)
+from datagen.workers.houses.habitat_files import (
+    FIX,
+    AssetFiles,
+    FindAsset,
+    config_of,
+    configured_files,
+    file_digest,
+    scene_folders,
+    semantic_classes,
+    sizes,
+    template_name,
 )
 from datagen.workers.houses.house import House, Room, StaticBody, Surface
 from datagen.workers.houses.loader import room_ids_at
@@ -51,14 +62,12 @@ from datagen.workers.source_statement import read_statement
 SCENE = ".scene_instance.json"
 _DATASET, _OBJECT, _STAGE = ".scene_dataset_config.json", ".object_config.json", ".stage_config.json"
 _LEXICON = "_semantic_lexicon.json"
-_MAX_FILES = 200_000  # files of one kind
 _MAX_SCENE_BYTES = 16 << 20
-_MAX_OBJECTS, _MAX_CLASSES = 5000, 10_000
+_MAX_OBJECTS = 5000
 _KEPT_MESHES = 512
 _SURFACE_HEIGHTS_M = (0.25, 1.5)
 _WALL_TOP_M = 2.2  # no robot reaches parts above it
 _SMALL_M = 0.35
-_FIX = "Download the scenes again."
 
 # From every file's frame to the world.
 _Y_UP_TO_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
@@ -71,20 +80,6 @@ _ROOM_BY_TYPE = (
     ("Toilet", "Bathroom"), ("ShowerDoor", "Bathroom"), ("Bed", "Bedroom"), ("Fridge", "Kitchen"),
     ("CounterTop", "Kitchen"), ("Sofa", "LivingRoom"), ("Television", "LivingRoom"),
 )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class AssetFiles:
-    """The files of a stage or an object; `scale` (3,) is along the mesh's axes."""
-
-    mesh: Path
-    config: Path | None = None
-    collision: Path | None = None
-    scale: tuple[float, ...] = (1.0, 1.0, 1.0)
-
-
-# The files of the template of a name, which may be a stage; None if there are none.
-FindAsset = Callable[[str, bool], AssetFiles | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +128,9 @@ class HabitatHouses:
         """The house. Raises InputError that names the file and the field."""
         scene, text = self._scene(house_id)
         digest = hashlib.sha256(text)
-        name = _template_name(scene.get("stage_instance"))
+        name = template_name(scene.get("stage_instance"))
         if (files := self.find(name, True)) is None:
-            raise scene.get("stage_instance").get("template_name").error(f"has no stage {name!r}", _FIX)
+            raise scene.get("stage_instance").get("template_name").error(f"has no stage {name!r}", FIX)
         stage = self._template(files, is_stage=True)
         digest.update(stage.digest)
         turn = np.eye(4) if self.stage_turn is None else self.stage_turn(house_id)
@@ -170,7 +165,7 @@ class HabitatHouses:
     def _scene(self, house_id: str) -> tuple[JsonNode, bytes]:
         if house_id not in self.scenes:
             raise InputError(self.root, "", f"has no house {house_id!r}", "Give the id of one of its houses.")
-        text = read_regular(self.scenes[house_id], _MAX_SCENE_BYTES, _FIX)
+        text = read_regular(self.scenes[house_id], _MAX_SCENE_BYTES, FIX)
         return parse_json(text, str(self.scenes[house_id])), text
 
     def _instances(self, scene: JsonNode) -> tuple[list[_Instance], Counter[str]]:
@@ -178,7 +173,7 @@ class HabitatHouses:
         found: list[_Instance] = []
         findings = Counter[str]()
         for number, entry in enumerate(scene.get("object_instances").items(_MAX_OBJECTS)):
-            name = _template_name(entry)
+            name = template_name(entry)
             if (files := self.find(name, False)) is not None and files.mesh.is_file():
                 found.append((number, name, files, entry, _pose(entry)))
             else:
@@ -195,11 +190,11 @@ class HabitatHouses:
             self._templates.move_to_end(file)
             return self._templates[file]
         S = np.diag([*files.scale, 1.0])
-        mesh, digest = read_glb(file).transformed(_Y_UP_TO_WORLD @ S), _file_digest(file)
+        mesh, digest = read_glb(file).transformed(_Y_UP_TO_WORLD @ S), file_digest(file)
         solid = mesh
         if files.collision is not None:
             solid = read_glb(files.collision).transformed(_Y_UP_TO_WORLD @ S)
-            digest = hashlib.sha256(digest + _file_digest(files.collision)).digest()
+            digest = hashlib.sha256(digest + file_digest(files.collision)).digest()
         if files.scale != (1.0, 1.0, 1.0):
             digest = hashlib.sha256(digest + S.tobytes()).digest()
         template = _Template(mesh, () if is_stage else convex_parts(solid), digest)
@@ -225,7 +220,7 @@ class HabitatHouses:
 
     def _type_of(self, name: str, files: AssetFiles) -> str:
         """The object type by the semantic id of the template's configuration, else by its name."""
-        config = _config(files)
+        config = config_of(files)
         found = None if config is None else config.find("semantic_id")
         if found is not None:
             known = self.types.get(int(found.number(-1, 1e9)))
@@ -249,15 +244,15 @@ def open_habitat(place: str) -> HabitatHouses:
     dataset = named[0] if base.is_dir() else base
     scenes = dict[str, Path]()
     listing: list[object] = []
-    for folder in _scene_folders(dataset):
+    for folder in scene_folders(dataset):
         for path, size in sizes(root / folder, f"*{SCENE}"):
             scenes[path.relative_to(root).as_posix().removesuffix(SCENE)] = path
             listing.append([path.relative_to(root).as_posix(), size])
     if not scenes:
-        raise InputError(dataset, "scene_instances", "names no folder with scenes", _FIX)
+        raise InputError(dataset, "scene_instances", "names no folder with scenes", FIX)
     found = {end: sizes(root, f"*{end}") for end in (".glb", _OBJECT, _STAGE, _LEXICON)}
     listing += [[p.relative_to(root).as_posix(), n] for files in found.values() for p, n in files]
-    types = {i: name for path, _ in found[_LEXICON] for i, name in _classes(path)}
+    types = {i: name for path, _ in found[_LEXICON] for i, name in semantic_classes(path)}
     digest = digest_of(["habitat-1", sorted(map(str, listing)), sorted(types.items())])
     index = {end: {p.name.removesuffix(end): p for p, _ in files[::-1]} for end, files in found.items()}
 
@@ -265,93 +260,21 @@ def open_habitat(place: str) -> HabitatHouses:
         own = PurePosixPath(name).name
         config = index[_STAGE if is_stage else _OBJECT].get(own)
         if config is not None:
-            return _configured(config, root)
+            return configured_files(config, root)
         return None if own not in index[".glb"] else AssetFiles(index[".glb"][own])
 
     scenes = dict(sorted(scenes.items()))
     return HabitatHouses(root, digest, scenes, types, find, statement=read_statement(root))
 
 
-def _scene_folders(dataset: Path) -> list[str]:
-    """The folders of scenes that a dataset's configuration names, relative to it."""
-    root = parse_json(read_regular(dataset, 1 << 20, _FIX), str(dataset))
-    paths = root.get("scene_instances").get("paths").get(".json")
-    return [_below(node, node.text()) for node in paths.items(100)]
-
-
-def _classes(path: Path) -> list[tuple[int, str]]:
-    root = parse_json(read_regular(path, 1 << 22, _FIX), str(path))
-    entries = list(root.get("classes").items(_MAX_CLASSES))
-    return [(int(e.get("id").number(-1, 1e9)), type_of_name(e.get("name").text())) for e in entries]
-
-
-def _configured(config: Path, root: Path) -> AssetFiles:
-    """The files that a configuration names. InputError for one outside the root, and for a mesh not y up."""
-    node = parse_json(read_regular(config, 1 << 20, _FIX), str(config))
-    paths = list[Path | None]()
-    for key in ("render_asset", "collision_asset"):
-        named = node.find(key)
-        path = None if named is None else (config.parent / named.text()).resolve()
-        if named is not None and path is not None and not path.is_relative_to(root.resolve()):
-            raise named.error(f"{named.text()!r} is not below {root}")
-        paths.append(path)
-    mesh, collision = paths[0] or config.with_name(config.name.split(".")[0] + ".glb"), paths[1]
-    up, scale = node.find("up"), node.find("scale")
-    if up is not None and np.abs(np.subtract(up.numbers(3, -1.0, 1.0), (0.0, 1.0, 0.0))).max() > 1e-3:
-        raise up.error("is not 0, 1, 0", "Turn the mesh so that y is up")
-    if collision is not None and (collision.suffix != ".glb" or not collision.is_file()):
-        collision = None
-    factors = (1.0, 1.0, 1.0) if scale is None else tuple(scale.numbers(3, 1e-3, 1e3))
-    return AssetFiles(mesh, config, collision, factors)
-
-
-def _config(files: AssetFiles) -> JsonNode | None:
-    path = files.config
-    if path is None or not path.is_file():
-        return None
-    return parse_json(read_regular(path, 1 << 20, _FIX), str(path))
-
-
 def _centre_m(files: AssetFiles, template: _Template) -> F64:
     """The point (3,) of a template, z up, that a scene may place: its configured centre of mass, or the
     centre of its bounding box."""
-    config = _config(files)
+    config = config_of(files)
     centre = None if config is None else config.find("COM")
     if centre is not None:
         return _Y_UP_TO_WORLD[:3, :3] @ centre.numbers(3, -EXTENT_M, EXTENT_M)
     return (template.mesh.vertices_m.min(0) + template.mesh.vertices_m.max(0)).astype(np.float64) / 2
-
-
-def _file_digest(path: Path) -> bytes:
-    with open_regular(path, MAX_FILE_BYTES, _FIX) as stream:
-        return hashlib.file_digest(stream, "sha256").digest()
-
-
-def sizes(folder: Path, pattern: str) -> list[tuple[Path, int]]:
-    """The files below a folder with their sizes. Raises InputError for too many or unprintable names."""
-    try:
-        found = [(p, p.stat().st_size) for p in itertools.islice(folder.rglob(pattern), _MAX_FILES + 1)]
-    except OSError as error:
-        raise InputError(str(error.filename), "", f"cannot be read: {error.strerror}", _FIX) from None
-    odd = next((p for p, _ in found if not p.relative_to(folder).as_posix().isprintable()), None)
-    if odd is not None:
-        raise InputError(odd, "", "has a name with unprintable characters", "Rename the file.")
-    if len(found) > _MAX_FILES:
-        raise InputError(folder, "", f"has more than {_MAX_FILES:,} files", "Remove some.")
-    return sorted(found)
-
-
-def _template_name(entry: JsonNode) -> str:
-    """A template's path below the assets folder; it may not lead out of it."""
-    node = entry.get("template_name")
-    return _below(node, node.text())
-
-
-def _below(node: JsonNode, name: str) -> str:
-    pieces = PurePosixPath(name).parts
-    if not pieces or name.startswith("/") or ".." in pieces or "\\" in name or "\0" in name:
-        raise node.error(f"{name!r} is not a path below the assets folder")
-    return name
 
 
 def _pose(entry: JsonNode) -> F64:
