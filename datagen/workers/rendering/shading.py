@@ -56,10 +56,9 @@ def render_shaded(scene: RayScene, rooms: Sequence[Room], camera: Camera, to_lig
     body, as little as the sky, and cast no shadow.
     """
     h, w = camera.height_px, camera.width_px
-    centres_m = scene.T_world_object[:, :3, 3]
-    radius_m = float((np.linalg.norm(centres_m - centres_m[0], axis=1) + scene.radii_m).max())
+    center_m, radius_m = _objects_sphere(scene)
     near = np.zeros(h * w, np.bool_)
-    near[target_pixels(camera, centres_m[0], _MARGIN * radius_m)] = True
+    near[target_pixels(camera, center_m, _MARGIN * radius_m)] = True
     rgb, depth_m = np.empty((h * w, 3), np.uint8), np.empty(h * w, np.float32)
     body, bare = np.empty(h * w, np.int16), replace(scene, objects=())
     for visible, pixels in (scene, np.flatnonzero(near)), (bare, np.flatnonzero(~near)):
@@ -108,13 +107,18 @@ def _in_shadow(scene: RayScene, points_m: F32, to_light: F32) -> npt.NDArray[np.
     limits = np.maximum((_LIGHT_M - points_m[:, 2]) / to_light[2], 0)
     dark = occluded(scene.house, points_m, towards, limits)
     # Objects lie around the target: few points can be in the shadow of any.
-    centres_m = scene.T_world_object[:, :3, 3]
-    radius_m = float((np.linalg.norm(centres_m - centres_m[0], axis=1) + scene.radii_m).max())
-    near = _below_sphere(points_m, to_light, centres_m[0], radius_m)
+    center_m, radius_m = _objects_sphere(scene)
+    near = _below_sphere(points_m, to_light, center_m, radius_m)
     for rays, T, radius_m in zip(scene.objects, scene.T_world_object, scene.radii_m, strict=True):
         rows = near[_below_sphere(points_m[near], to_light, T[:3, 3], radius_m)]
         dark[rows] |= occluded(rays, *into_frame(T, points_m[rows], towards[rows]), limits[rows])
     return dark
+
+
+def _objects_sphere(scene: RayScene) -> tuple[F64, float]:
+    """Centre (3,), the target's, and radius (m) of a sphere that holds all objects, world."""
+    centers_m = scene.T_world_object[:, :3, 3]
+    return centers_m[0], float((np.linalg.norm(centers_m - centers_m[0], axis=1) + scene.radii_m).max())
 
 
 def _below_sphere(points_m: F32, to_light: F32, centre_m: F64, radius_m: float) -> I64:
