@@ -32,9 +32,8 @@ from benchmarks.options import drawn_scenes
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import NoiseParams
 from datagen.train.inputs import Bools
-from datagen.train.prediction.boxes import Box, box_mask
+from datagen.train.prediction.clicks import Box, box_mask, click_mask
 from datagen.train.prediction.frames import Pinhole, RgbdImage, read_place
-from datagen.train.prediction.region_growing import grow_mask
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.rendering import Frame
 from datagen.workers.rendering.embree import RayScene, render_rays
@@ -55,7 +54,7 @@ def main() -> None:
     parser.add_argument("--each", action="store_true", help="print objects with a click that is not right")
     parser.add_argument("--boxes", action="store_true", help="give boxes in place of clicks")
     options = parser.parse_args()
-    select, places = (box_mask, _box) if options.boxes else (grow_mask, _pixels)
+    select, places = (box_mask, _box) if options.boxes else (click_mask, clicks_on)
     counts: dict[str, npt.NDArray[np.int64]] = {}
     spent = list[float]()
     for source, name, image, T, labels in [*_folders(options.folders), *_scenes(options)]:
@@ -69,7 +68,7 @@ def main() -> None:
             rng = np.random.default_rng(0)
             said = list[str]()
             given: list[Any] = _inner(asked, rng) if label == ROOM else places(asked)
-            middle = _pixels(asked)[0]
+            middle = clicks_on(asked)[0]
             for place in given:
                 began = time.process_time()
                 mask = _selected(select, image, place, T)
@@ -127,7 +126,7 @@ def _box(asked: Bools) -> list[Box]:
     return [(max(int(left) - 3, 0), max(int(top) - 3, 0), min(int(right) + 4, w), min(int(bottom) + 4, h))]
 
 
-def _pixels(asked: Bools) -> list[tuple[int, int]]:
+def clicks_on(asked: Bools) -> list[tuple[int, int]]:
     """The middle pixel (u, v) of an object, and those halfway to its four ends, inside its outline."""
     inside = np.asarray(ndimage.distance_transform_edt(np.pad(asked, 1)))[1:-1, 1:-1]
     v, u = np.nonzero(inside > 0.4 * inside.max())
@@ -162,7 +161,7 @@ def _scenes(options: argparse.Namespace) -> Iterator[Case]:
             exact = render_rays(rays, scene.camera)
             for name, params in _noises(scene.camera.fx_px).items():
                 frame = add_noise(exact, params, np.random.default_rng(index)) if params.enabled else exact
-                yield f"{kind}, {name}", str(index), *_case(frame)
+                yield f"{kind}, {name}", str(index), *case_of(frame)
 
 
 def _noises(fx_px: float) -> dict[str, NoiseParams]:
@@ -193,7 +192,8 @@ def _stacked(rays: RayScene) -> RayScene:
     return replace(rays, objects=objects, radii_m=radii, T_world_object=np.array([*poses, top]))
 
 
-def _case(frame: Frame) -> tuple[RgbdImage, F64, Labels]:
+def case_of(frame: Frame) -> tuple[RgbdImage, F64, Labels]:
+    """A rendered frame as `predict` reads it, its camera's pose, and its labels (H, W)."""
     c, body = frame.camera, frame.body.astype(np.int64)
     pinhole = Pinhole(c.fx_px, c.fy_px, c.cx_px - 0.5, c.cy_px - 0.5)
     depth_m = (np.round(1000 * frame.depth_m) / 1000).astype(np.float32)

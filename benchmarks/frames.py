@@ -20,9 +20,9 @@ import numpy as np
 from benchmarks.options import drawn_scenes
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import NoiseParams
+from datagen.train.prediction.clicks import click_mask
 from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
 from datagen.train.prediction.ground import find_ground, floor_points
-from datagen.train.prediction.region_growing import grow_mask
 from datagen.train.prediction.target import locate
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.rendering.embree import render_rays
@@ -106,7 +106,7 @@ def _overlap(scene: Scene, frame: SensorFrame) -> float:
     middle = [axis.mean() for axis in np.nonzero(image.mask)]
     k = int(np.argmin((v - middle[0]) ** 2 + (u - middle[1]) ** 2))
     try:
-        grown = grow_mask(image, (int(u[k]), int(v[k])), scene.camera.T_world_camera)
+        grown = click_mask(image, (int(u[k]), int(v[k])), scene.camera.T_world_camera)
     except InputError:
         return 0.0
     return float((grown & truth).sum() / (grown | truth).sum())

@@ -10,6 +10,7 @@ from datagen.schemas.errors import InputError
 RELEASED = "released"
 FOLDER = Path(str(files("datagen.released")))
 CHECKPOINT, PROGRAM, FRAME = "model.safetensors", "program.safetensors", "frame"
+CLICKS = "clicks.safetensors"  # weights of the network that segments what is clicked
 # The facts, how the model was made, and the page of both.
 CARD, RECIPE, CARD_PAGE = "card.json", "recipe.md", "MODEL_CARD.md"
 MAP = "map.yaml"  # of the house, in the sample frame's folder
@@ -25,6 +26,11 @@ def released_checkpoint() -> Path:
 def released_program() -> Path:
     """The released model as NumPy's operations (`datagen.train.program_scorer`)."""
     return _shipped_path(PROGRAM)
+
+
+def released_click_network() -> Path:
+    """Weights of `datagen.train.prediction.click_network`."""
+    return _shipped_path(CLICKS)
 
 
 def checkpoint_file(name: str) -> str | None:

@@ -25,12 +25,11 @@ from datagen.train.prediction.base_cells import (
     choose,
     observe_cells,
 )
-from datagen.train.prediction.boxes import Box, box_mask
+from datagen.train.prediction.clicks import Box, box_mask, click_mask
 from datagen.train.prediction.frames import SensorFrame, image_frame
 from datagen.train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
 from datagen.train.prediction.ground import Ground, find_ground
 from datagen.train.prediction.occupancy import KnownFloor
-from datagen.train.prediction.region_growing import grow_mask
 from datagen.train.prediction.target import Filled, TargetBox, fill_target, locate
 from datagen.train.prediction.trained_robots import robot_notes, trained_robots
 from datagen.train.program_scorer import ProgramScorer
@@ -175,7 +174,7 @@ def _with_target(
         raise InputError(option, "", "is given for a frame with a mask", f"Omit {option}, or the mask")
     T = grounds[0].T_world_camera
     if click is not None:
-        mask = grow_mask(image, click, T)
+        mask = click_mask(image, click, T)
     else:
         assert box is not None
         mask = box_mask(image, box, T)

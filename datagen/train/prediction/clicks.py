@@ -1,0 +1,132 @@
+"""Segment the object at a clicked pixel, or in a box; refuse what no hand can grasp."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from datagen.schemas.errors import InputError
+from datagen.train.inputs import F64, Bools
+from datagen.train.prediction.click_network import object_logits
+from datagen.train.prediction.frames import RgbdImage
+
+_LARGEST_M = 0.45  # a larger region is furniture, or several objects
+_LEAST_PX = 20
+_NEXT_PX = 2  # a mask may begin this far from the click
+_PATCH_PX = 12  # around a click on a surface, to say which
+_LEVEL, _UPRIGHT, _ON_FLOOR_M = 0.9, 0.3, 0.04
+# Where in a box an object is looked for, and the least overlap of the object's own box with it.
+_PLACES = ((0.5, 0.5), (0.3, 0.5), (0.7, 0.5), (0.5, 0.3), (0.5, 0.7))
+_LEAST_OVERLAP = 0.3
+_FIX = "Click on the target itself, or give its box or mask"
+
+Box = tuple[int, int, int, int]
+
+
+def click_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> Bools:
+    """Mask (H, W) of the object at pixel (u, v), as `click_network` sees it.
+
+    InputError where nothing was measured, for a click on a wall, a table or the floor, and for a region of
+    the size of furniture.
+    """
+    h, w = image.depth_m.shape
+    u, v = click
+    if not (0 <= u < w and 0 <= v < h):
+        raise InputError("--click", f"{u},{v}", f"is outside the image of {w}x{h}", "Give a pixel u,v in it")
+    u, v = image.pixel_of(u, v)
+    depth_m, said = image.depth_m, f"{click[0]},{click[1]}"
+    if depth_m[v, u] == 0:
+        near = (depth_m[max(v - 15, 0) : v + 16, max(u - 15, 0) : u + 16] > 0).any()
+        fix = "Give another pixel of the target" if near else "Take the frame again, or give its box or mask"
+        raise InputError("--click", said, "has no depth", fix)
+    mask = _masked(image, (u, v), T_world_camera)
+    if mask is None:
+        raise InputError("--click", said, f"lies on {_surface(image, (u, v), T_world_camera)}", _FIX)
+    _refuse_large(image, mask, T_world_camera, "--click", said)
+    return mask
+
+
+def _masked(image: RgbdImage, pixel: tuple[int, int], T_world_camera: F64) -> Bools | None:
+    """The region of the object next to a pixel with depth; None where it is on none."""
+    u, v = pixel
+    likely = (object_logits(image, pixel, T_world_camera) > 0) & (image.depth_m > 0)
+    labels = np.zeros(likely.shape, np.int64)
+    ndimage.label(likely, np.ones((3, 3)), output=labels)
+    near = labels[max(v - _NEXT_PX, 0) : v + _NEXT_PX + 1, max(u - _NEXT_PX, 0) : u + _NEXT_PX + 1]
+    if not near.any():
+        return None
+    mask = labels == np.bincount(near[near > 0]).argmax()
+    return mask if mask.sum() >= _LEAST_PX else None
+
+
+def box_mask(image: RgbdImage, box: Box, T_world_camera: F64) -> Bools:
+    """Mask (H, W) of the object in a box: left, top, right, bottom; the last two exclusive.
+
+    Of the objects at five places in the box the one whose own box fits best, cut at the box. InputError for a
+    box outside the image, for one that no object fills, and for an object of the size of furniture.
+    """
+    h, w = image.depth_m.shape
+    text, (left, top, right, bottom) = ",".join(map(str, box)), box
+    if not (0 <= left < right - 2 and 0 <= top < bottom - 2 and right <= w and bottom <= h):
+        problem = f"is no box of 3 pixels or more in the image of {w}x{h}"
+        raise InputError("--box", text, problem, "Give LEFT,TOP,RIGHT,BOTTOM in pixels")
+    if image.source is not None:
+        ends = np.array([image.pixel_of(u, v) for u in (left, right - 1) for v in (top, bottom - 1)])
+        (left, top), (right, bottom) = ends.min(axis=0), ends.max(axis=0) + 1
+    v, u = np.nonzero(image.depth_m[top:bottom, left:right])
+    if not len(v):
+        raise InputError("--box", text, "has no depth", "Take the frame again, or give the target's mask")
+    size = right - left, bottom - top
+    nearest = {int(np.hypot(u - x * size[0], v - y * size[1]).argmin()) for x, y in _PLACES}
+    masks = [_masked(image, (left + int(u[k]), top + int(v[k])), T_world_camera) for k in sorted(nearest)]
+    overlap, _, mask = max(
+        (
+            (_overlap(mask, (left, top, right, bottom)), -k, mask)
+            for k, mask in enumerate(masks)
+            if mask is not None
+        ),
+        default=(0.0, 0, image.depth_m > 0),
+    )
+    if overlap < _LEAST_OVERLAP:
+        fix = "Give the sides of a box around the target, or its mask"
+        raise InputError("--box", text, "has no object in it that fills it", fix)
+    cut = np.zeros_like(mask)
+    cut[top:bottom, left:right] = mask[top:bottom, left:right]
+    _refuse_large(image, cut, T_world_camera, "--box", text)
+    return cut
+
+
+def _overlap(mask: Bools, box: Box) -> float:
+    """Intersection over union of a mask's box with another."""
+    (top, *_, bottom), (left, *_, right) = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
+    across = min(int(right) + 1, box[2]) - max(int(left), box[0])
+    down = min(int(bottom) + 1, box[3]) - max(int(top), box[1])
+    both = max(across, 0) * max(down, 0)
+    areas = (right + 1 - left) * (bottom + 1 - top) + (box[2] - box[0]) * (box[3] - box[1])
+    return both / float(areas - both)
+
+
+def _refuse_large(image: RgbdImage, mask: Bools, T_world_camera: F64, option: str, value: str) -> None:
+    """Raise InputError where a mask is that of furniture or of several objects."""
+    points_m = image.points(np.flatnonzero(mask)) @ T_world_camera[:3, :3].T
+    low, high = np.percentile(points_m, (2, 98), axis=0)
+    wide_m, tall_m = float(np.hypot(*(high - low)[:2])), float((high - low)[2])
+    if max(wide_m, tall_m) > _LARGEST_M:
+        problem = f"selects a region {wide_m:.2f} m wide and {tall_m:.2f} m high, more than a hand can grasp"
+        raise InputError(option, value, problem, "Give a narrower --box around the target, or its mask")
+
+
+def _surface(image: RgbdImage, pixel: tuple[int, int], T_world_camera: F64) -> str:
+    """What kind of surface of the room a pixel lies on."""
+    (u, v), n = pixel, _PATCH_PX
+    part = image.cut(max(u - n, 0), max(v - n, 0), u + n + 1, v + n + 1)
+    normal = part.facets(T_world_camera)[part.depth_m > 0].sum(axis=0)
+    rise = abs(normal[2]) / max(float(np.linalg.norm(normal)), 1e-12)
+    height_m = float(np.median(part.world_grid(T_world_camera)[..., 2][part.depth_m > 0]))
+    if rise > _LEVEL:
+        return (
+            "the floor"
+            if abs(height_m) < _ON_FLOOR_M
+            else f"a level surface {height_m:.2f} m above the floor"
+        )
+    return "an upright plane, as of a wall or a cabinet" if rise < _UPRIGHT else "nothing that stands out"
