@@ -127,11 +127,13 @@ def _drawn_clouds(scenes: int = 4) -> Clouds[Any]:
 
 
 def _batch(clouds: Clouds[Any], robots: int, candidates: int, scenes: int) -> Batch[Any]:
-    """The first clouds, each with robots, each with candidates around it."""
+    """The first clouds, again where they are too few, each with robots, each with candidates around it."""
     rng = np.random.default_rng(1)
     r, n = scenes * robots, scenes * robots * candidates
     return Batch(
-        clouds=Clouds(**{name: values[:scenes] for name, values in vars(clouds).items()}),
+        clouds=Clouds(
+            **{name: values[np.arange(scenes) % len(values)] for name, values in vars(clouds).items()}
+        ),
         robots=RobotInputs(
             np.repeat(np.arange(scenes), robots),
             *(

@@ -17,7 +17,7 @@ from datagen.workers.objects.model import ObjectSource
 from datagen.workers.world import World
 
 # Raise it when the same house may be judged differently.
-_VERSION = 1
+_VERSION = 2
 _CACHE = CacheFolder("surveys", most_files=64)
 
 

@@ -128,14 +128,13 @@ class HabitatHouses:
         """The house. Raises InputError that names the file and the field."""
         scene, text = self._scene(house_id)
         digest = hashlib.sha256(text)
-        name = template_name(scene.get("stage_instance"))
-        if (files := self.find(name, True)) is None:
-            raise scene.get("stage_instance").get("template_name").error(f"has no stage {name!r}", FIX)
-        stage = self._template(files, is_stage=True)
+        entry = scene.get("stage_instance")
+        stage = self._template(self._stage_files(entry), is_stage=True)
         digest.update(stage.digest)
-        turn = np.eye(4) if self.stage_turn is None else self.stage_turn(house_id)
-        mesh = _without_ceiling(stage.mesh.transformed(_in_world(turn)))
-        refuse_unfit_stage(scene.get("stage_instance"), mesh)
+        T_world = np.eye(4) if entry.find("translation") is None else _pose(entry)
+        T_world = T_world if self.stage_turn is None else _in_world(self.stage_turn(house_id))
+        mesh = _without_ceiling(stage.mesh.transformed(T_world))
+        refuse_unfit_stage(entry, mesh)
         placed: list[tuple[StaticBody, F64, F64, Mesh]] = []
         instances, findings = self._instances(scene)
         for number, name, files, entry, T_world in instances:
@@ -160,7 +159,15 @@ class HabitatHouses:
 
     def examine(self, house_id: str) -> Mapping[str, int]:
         """The findings of the house; its meshes are not read. Raises InputError as `load` does for others."""
-        return self._instances(self._scene(house_id)[0])[1]
+        scene, _ = self._scene(house_id)
+        self._stage_files(scene.get("stage_instance"))
+        return self._instances(scene)[1]
+
+    def _stage_files(self, entry: JsonNode) -> AssetFiles:
+        files = self.find(template_name(entry), True)
+        if files is None or not files.mesh.is_file():
+            raise entry.get("template_name").error(f"has no stage {template_name(entry)!r}", FIX)
+        return files
 
     def _scene(self, house_id: str) -> tuple[JsonNode, bytes]:
         if house_id not in self.scenes:

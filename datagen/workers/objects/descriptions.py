@@ -88,7 +88,8 @@ def _sdf(path: Path) -> Description:
     root = read_xml(path, _FIX)
     models = [*root.iter("model")]
     if root.tag != "sdf" or len(models) != 1:
-        raise _wrong(path, root.tag[:80], f"is no SDF of one model, but of {len(models)}")
+        problem = f"is no SDF of one model, but of {len(models)}" if root.tag == "sdf" else "is not <sdf>"
+        raise _wrong(path, root.tag[:80], problem)
     for joint in models[0].iter("joint"):
         if joint.get("type") != "fixed":
             raise _wrong(path, f"joint {joint.get('name')}", "moves: the object is not rigid")

@@ -56,7 +56,7 @@ class FolderObjects(LoadedOnce):
         files, tree = find_objects(folder)
         self._files = {entry.name: entry for entry in files}
         self._table = _read_table(folder / TABLE, {*self._files, ALL})
-        key = digest_of([tree, VERSION, versions_of(_LIBRARIES)])
+        key = digest_of([tree, [*self._files], VERSION, versions_of(_LIBRARIES)])
         stored = _LISTS.load(key)
         if stored is None:
             with ThreadPoolExecutor(os.cpu_count()) as pool:

@@ -26,6 +26,8 @@ _INNER = ("google_16k", "google_64k", "google_512k", "poisson", "tsdf", "meshes"
 _COLLISION = re.compile(
     r"(?:^|[-_. ])(?:col|coll|collision|collider|convex|vhacd|coacd|hull|contact\d*)(?=$|[-_. ])", re.I
 )
+# Of a description beside NAME: Gazebo's model for older versions of SDF, robosuite's marker of a goal.
+_TWIN = re.compile(r"(?<=^model)-\d+_\d+$|[-_]visual$")
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,8 @@ def find_objects(root: Path) -> tuple[list[ObjectFiles], str]:
     found: list[ObjectFiles] = []
     for folder, files in folders:
         described = [path for path in files if path.suffix.lower() in DESCRIPTIONS and _describes(path)]
+        stems = {path.stem for path in described}
+        described = [p for p in described if (own := _TWIN.sub("", p.stem)) == p.stem or own not in stems]
         if described:
             covered.add(folder)
             found += [ObjectFiles(_name(path, root), path) for path in described]

@@ -199,7 +199,7 @@ STAGE = "stages/iTHOR/home"
         (STAGE, None, "has no key 'object_instances'"),
         ("../../../etc/passwd", [], "not a path below"),
         ("/etc/passwd", [], "not a path below"),
-        ("stages/none", [], "cannot be read"),
+        ("stages/none", [], "has no stage 'stages/none'"),
         (STAGE, {}, "an object, not a list"),
     ],
 )

@@ -167,6 +167,17 @@ def test_another_dataset_of_a_folder_is_named_by_its_file(tmp_path: Path) -> Non
     assert source.load(source.house_ids()[0]).findings["articulated objects"] == 1
 
 
+def test_a_stage_stands_where_the_scene_places_it(tmp_path: Path) -> None:
+    file = write_replicacad(tmp_path) / "configs/scenes/apt_0.scene_instance.json"
+    scene = json.loads(file.read_text())
+    scene["stage_instance"] |= {"translation": [-1.0, 0.0, 2.0], "rotation": [HALF, 0, HALF, 0]}
+    write(file, scene)
+    house = load(tmp_path)
+    # 6 m along the file's x are turned to its -z, which is the world's y.
+    np.testing.assert_allclose(house.rooms[0].polygon_m.min(0), (-1, -2), atol=1e-4)
+    np.testing.assert_allclose(house.rooms[0].polygon_m.max(0), (4, 4), atol=1e-4)
+
+
 @settings(max_examples=15)
 @given(
     st.floats(-180, 180),
@@ -258,6 +269,14 @@ def test_bad_files_are_named(tmp_path: Path, file: str, value: Any, named: str) 
     with pytest.raises(InputError, match=named) as caught:
         load(root)
     assert Path(file).name in str(caught.value)
+
+
+def test_a_check_finds_a_missing_stage(tmp_path: Path) -> None:
+    root = write_hssd(tmp_path)
+    (root / "stages/102344022.glb").unlink()
+    source = open_houses(f"habitat:{root}")
+    with pytest.raises(InputError, match="has no stage 'stages/102344022'"):
+        source.examine(source.house_ids()[0])  # type: ignore[attr-defined]
 
 
 def test_compressed_meshes_are_refused_with_what_to_do(tmp_path: Path) -> None:

@@ -114,6 +114,15 @@ def test_published_trees_and_roles_of_files_give_one_object_each(tmp_path: Path)
     assert banana.size_m[2] == pytest.approx(0.04) and banana.mass_kg == 0.066
 
 
+def test_older_versions_and_markers_of_an_object_are_no_objects(tmp_path: Path) -> None:
+    write_as("sdf", box(0.05, 0.05, 0.1), tmp_path / "coke_can")
+    write_as("urdf", box(0.05, 0.05, 0.1), tmp_path / "tea-visual")
+    write_as("mjcf", box(0.05, 0.05, 0.1), tmp_path / "bread")
+    for name, twin in (("coke_can/model.sdf", "model-1_4.sdf"), ("bread/bread.xml", "bread-visual.xml")):
+        (tmp_path / name).with_name(twin).write_bytes((tmp_path / name).read_bytes())
+    assert sorted(open_objects(f"folder:{tmp_path}").names()) == ["bread", "coke_can", "tea-visual"]
+
+
 @pytest.mark.parametrize("write", [write_bundle, write_maniskill])
 def test_an_indexed_folder_is_read_as_ycb_reads_it(write: object, tmp_path: Path) -> None:
     folder = write(tmp_path / "set")  # type: ignore[operator]

@@ -68,6 +68,7 @@ BAD: dict[str, tuple[str, str | bytes, str]] = {
     "urdf mesh missing": ("a.urdf", URDF.format('<mesh filename="x.stl"/>', ""), "cannot be read"),
     "urdf without shapes": ("a.urdf", '<robot name="a"><link name="l"/></robot>', "no shape"),
     "sdf of two models": ("a.sdf", SDF.format("", "<model name='b'/>"), "one model"),
+    "sdf of gazebo 1.0": ("a.sdf", "<gazebo version='1.2'><model name='a'/></gazebo>", "is not <sdf>"),
     "sdf joint": ("a.sdf", SDF.format("", "<joint name='j' type='revolute'/>"), "not rigid"),
     "sdf without size": ("a.sdf", SDF.format("<box/>", ""), "finite numbers"),
     "mjcf joint": ("a.xml", MJCF.format("", '<joint name="h"/><geom size="0.03"/>'), "not rigid"),
