@@ -57,7 +57,6 @@ _HEADINGS: dict[str, dict[str, tuple[str, str]]] = {
         "show": ("datagen.commands.show:show", "Draw a picture of one scene of a run."),
         "view": ("datagen.commands.view:view", "Open scenes of a run in the viewer Rerun."),
         "audit": ("datagen.commands.audit:audit", "Show the cost of labels by stage."),
-        "report": ("datagen.commands.report:report", "Write one HTML page about runs and models."),
         "export": ("datagen.commands.export:export", "Write a run in the format of another program."),
     },
     "Check runs": {

@@ -16,9 +16,9 @@ from datagen.console.command_lines import (
     prints,
     words_of,
 )
-from datagen.console.options import AsJson, PathOrAddress, PathsOrAddresses, Whole
+from datagen.console.options import AsJson, File, PathOrAddress, PathsOrAddresses, Whole
 from datagen.console.printing import print_rows
-from datagen.evaluation.output import Outputs, output_files, print_report, write_report
+from datagen.evaluation.output import output_file, print_report, write_report
 from datagen.jobs.job import JobOptions
 from datagen.jobs.job_report import print_job
 
@@ -121,7 +121,7 @@ def score(
     *,
     runs: PathOrAddress | None = None,
     fit: PathsOrAddresses | None = None,
-    out: Outputs = None,
+    out: File | None = None,
     json: AsJson = False,
 ) -> dict[str, Any]:
     """Score methods on the benchmark's runs, and print the report.
@@ -129,14 +129,14 @@ def score(
     A METHOD is `released`, a checkpoint, a CSV file of scores, or the name of a baseline. A run that is not
     the benchmark's is refused with its differences.
 
-    For example: datagen benchmark score released mine.csv scalars --runs runs --fit val --out board.html
+    For example: datagen benchmark score released mine.csv scalars --runs runs --fit val --out board.json
 
     Args:
         methods: Methods to compare.
         runs: Folder with the runs of `datagen benchmark make`, or a pack; runs that it lacks are not scored.
             [default: the pack that comes with datagen]
         fit: Run in validation houses to fit baselines on; repeat for more.
-        out: File to write, .json or .html; repeat for both.
+        out: File to write, FILE.json.
     """
     from datagen.evaluation.benchmark import (
         present_runs,
@@ -149,7 +149,7 @@ def score(
     from datagen.evaluation.report import Part, evaluation_report, parts_by_place, parts_of_grids
     from datagen.evaluation.runs import open_evaluated_runs
 
-    files = output_files(out)
+    file = output_file(out)
     folder = str(shipped_pack() if runs is None else runs)
     definition = read_benchmark(None if "://" in folder else Path(folder))
     paths = present_runs(folder, definition)
@@ -172,5 +172,5 @@ def score(
     report = evaluation_report(seconds, compared, opened, parts, [Path(p).name for p in fitted_on], {})
     report["runs"] = [{**each, "place": name} for each, name in zip(report["runs"], wanted, strict=True)]
     report["benchmark"] = definition.record(wanted)
-    write_report(report, columns, files)
+    write_report(report, file)
     return report

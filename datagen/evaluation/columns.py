@@ -17,7 +17,7 @@ from datagen.workers.bases.candidate_sets import in_set
 # Further columns of a batch that the evaluation needs.
 EXTRA = (
     *("base_yaw_rad", "base_is_clear", "distance_m", "mount_distance_m"),
-    *("house_id", "object_name", "place", "scene_index"),
+    *("house_id", "place", "scene_index"),
 )
 
 
@@ -36,7 +36,6 @@ class Columns:
     reach_m: F32  # (N,)
     scores: Mapping[str, F64]  # (N,) each
     house: Array  # (S,) text
-    target: Array  # (S,) text
     place: Array  # (S,) index in PLACE_KINDS
     run: I64  # (S,) index of the run
     is_grid: Bools  # (S,) whether it has all cells of a grid, for one robot
@@ -76,7 +75,7 @@ class Columns:
         return in_set(candidates, self.is_clear, self.is_reachable)
 
 
-_SCENE_COLUMNS = ("house", "target", "place", "run", "is_grid")
+_SCENE_COLUMNS = ("house", "place", "run", "is_grid")
 _OF_ALL = ("scores", "reached_runs")
 
 
@@ -130,7 +129,6 @@ def _scenes(batch: Batch[Array], run: int, cells: int) -> dict[str, Array]:
     candidates = np.bincount(batch.robots.cloud_row[batch.candidates.robot_row], minlength=n)
     return {
         "house": batch.extra["house_id"],
-        "target": batch.extra["object_name"][:, 0],
         "place": batch.extra["place"],
         "run": np.full(n, run, np.int64),
         "is_grid": (robots == 1) & (candidates == cells) & (cells > 0),

@@ -38,7 +38,6 @@ def make_columns(
         reach_m=reach_m,
         scores=dict(scores) if scores is not None else {"random": rng.random(n)},
         house=np.array([f"house-{k % 5}" for k in range(n_scenes)], object),
-        target=np.array([f"object-{k % 3}" for k in range(n_scenes)], object),
         place=np.arange(n_scenes, dtype=np.uint8) % 2,
         run=np.zeros(n_scenes, np.int64),
         is_grid=np.ones(n_scenes, np.bool_),

@@ -151,9 +151,9 @@ def test_the_extra_predict_is_enough_in_an_empty_folder(wheel: Path, pack: Path,
     assert done("python", "-c", "import torch").returncode != 0
     assert done("python", "-c", code_of_the_documents()).returncode == 0
     rules = ("proximity", "reach-share", "threshold", "analytic")
-    scored = done("datagen", "benchmark", "score", *rules, "my_scores.csv", "--out", "board.html")
+    scored = done("datagen", "benchmark", "score", *rules, "my_scores.csv", "--out", "board.json")
     assert scored.returncode == 0, scored.stderr
-    assert "my_scores" in (tmp_path / "empty" / "board.html").read_text()
+    assert "my_scores" in (tmp_path / "empty" / "board.json").read_text()
     released = done("datagen", "benchmark", "score", "released", "--json")
     assert released.returncode == 0, released.stderr
     (method,) = json.loads(released.stdout)["methods"]
