@@ -24,7 +24,7 @@ from cyclopts.exceptions import (
 )
 
 from datagen import __version__
-from datagen.cluster.ray_settings import ENDING_RAY, job_environment
+from datagen.cluster.ray_settings import ENDING_RAY
 from datagen.console.command_lines import PRINTER, Interrupted, begin_with_process
 from datagen.console.printing import drop_output
 from datagen.display.progress import LossyStream
@@ -227,8 +227,7 @@ def main() -> None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
     sys.stderr = LossyStream(sys.stderr)
     begin_with_process()
-    with job_environment():
-        code = run(sys.argv[1:])
+    code = run(sys.argv[1:])
     if any(thread.name == ENDING_RAY for thread in threading.enumerate()):
         os._exit(code)  # the end of the interpreter would wait for Ray's stopped servers too
     sys.exit(code)
