@@ -1,4 +1,4 @@
-"""`datagen benchmark`: make the runs of the frozen benchmark, pack them, and score methods on them."""
+"""`datagen benchmark`: make the runs of the frozen benchmark, and score methods on them."""
 
 from __future__ import annotations
 
@@ -22,9 +22,7 @@ from datagen.evaluation.output import output_file, print_report, write_report
 from datagen.jobs.job import JobOptions
 from datagen.jobs.job_report import print_job
 
-app = App(
-    name="benchmark", help="Make the runs of the frozen benchmark, pack them, and score methods on them."
-)
+app = App(name="benchmark", help="Make the runs of the frozen benchmark, and score methods on them.")
 
 
 @app.command
@@ -76,40 +74,6 @@ def make(
         (n, "candidates and labels as frozen" if r.digests else "not frozen yet") for n, r in runs.items()
     ]
     print_rows(f"benchmark {definition.version} in {folder}", rows)
-    return 0
-
-
-@app.command
-def pack(
-    *,
-    runs: PathOrAddress,
-    out: Path,
-    scenes: Whole = 100,
-    without_labels: bool = False,
-) -> int:
-    """Pack the first scenes of the benchmark's runs, one small file a run, with a definition of their own.
-
-    `score --runs OUT` and any Zarr reader open a pack. Equal runs give equal bytes.
-
-    For example: datagen benchmark pack --runs runs --out pack
-
-    Args:
-        runs: Folder with the runs of `datagen benchmark make`; those that it lacks are not packed.
-        out: New folder for the pack.
-        scenes: Scenes of all runs together, of which each has an equal share.
-        without_labels: Keep the labels back; `score` refuses such a pack.
-    """
-    from datagen.evaluation.benchmark import present_runs, read_benchmark, refuse_differing, write_pack
-
-    definition = read_benchmark(None if "://" in str(runs) else Path(runs))
-    paths = present_runs(str(runs), definition)
-    for name, path in paths.items():
-        refuse_differing(path, name, definition.runs[name], definition.version)
-    rows = [
-        (file.name, f"{run.n:,} candidates, {file.stat().st_size:,} bytes")
-        for file, run in write_pack(paths, definition, out, scenes, not without_labels)
-    ]
-    print_rows(f"pack of benchmark {definition.version} in {out}", rows)
     return 0
 
 

@@ -53,7 +53,7 @@ def evaluate(
         fit: Run in validation houses to fit baselines on; repeat for more.
         baselines: Baseline to compare with, or none; repeat for more. [default: all]
         heuristic: Parameters of the analytic baseline, from `datagen calibrate`.
-        arrival: Arrival error: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv. [default: 0 to 25 cm]
+        arrival: Arrival error: normal:M[,YAW], disc:M[,YAW] or nav2. [default: 0 to 25 cm]
         closed_loop: Scenes of the closed loop, the first whole grids with a good base pose. [default: 0]
         execute: Execute the plans of the closed loop in disturbed physics, which takes most of the time.
         workers: Processes of the closed loop; 0: this process, for debuggers. [default: cores]

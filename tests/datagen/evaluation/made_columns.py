@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from datagen.evaluation.columns import Columns
-from datagen.schemas.fields import facing_rad
 
 
 def make_columns(
@@ -32,7 +31,6 @@ def make_columns(
         label=label,
         is_clear=is_clear,
         base_xy_m=base_xy_m,
-        base_yaw_rad=facing_rad(-base_xy_m).astype(np.float32),
         distance_m=(mount_m * 0.9).astype(np.float32),
         mount_distance_m=mount_m,
         reach_m=reach_m,
@@ -55,7 +53,6 @@ def make_grids(label: np.ndarray, score: np.ndarray) -> Columns:
     return replace(
         made,
         base_xy_m=base_xy_m,
-        base_yaw_rad=facing_rad(-base_xy_m).astype(np.float32),
         label=label.ravel()[order].astype(bool),
         is_clear=np.ones(len(made), bool),
         scores={"model": score.ravel()[order]},

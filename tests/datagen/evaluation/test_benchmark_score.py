@@ -218,10 +218,10 @@ def test_the_code_of_the_documents_writes_scores_without_this_project(
 
 def test_whole_grids_of_all_runs_are_divided_by_place() -> None:
     columns = make_columns(np.random.default_rng(1), 9, 16)
-    columns = replace(columns, is_grid=np.arange(9) != 2)
+    columns = replace(columns, is_grid=np.arange(9) != 2, run=np.arange(9))
     parts = {part.title: part.columns for part in parts_by_place(columns)}
-    assert {title: some.target.tolist() for title, some in parts.items()} == {
-        "grids, top": columns.target[[0, 4, 6, 8]].tolist(),
-        "grids, shelf": columns.target[[1, 3, 5, 7]].tolist(),
+    assert {title: some.run.tolist() for title, some in parts.items()} == {
+        "grids, top": [0, 4, 6, 8],
+        "grids, shelf": [1, 3, 5, 7],
     }
     assert not parts_by_place(replace(columns, place=np.zeros(9, np.uint8)))
