@@ -27,7 +27,6 @@ from datagen.console.options import AsJson
 from datagen.console.printing import print_json, size
 from datagen.workers.content_cache import cache_folder
 from datagen.workers.extras import EXTRAS, how_to_get
-from datagen.workers.robots import ROBOTS, robot_source
 
 Status = Literal["ok", "warn", "fail"]
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
@@ -98,13 +97,7 @@ def checks() -> Iterator[Check]:
     if find_spec("ray"):
         yield Check("ray", partial(_probe, RAY), f"{_AGAIN} ray; or use --workers 0.")
     if not EXTRAS["sim"].missing():
-        again = f"{_AGAIN} numba coal mani-skill"
-        for name in ROBOTS:
-            from_sim = robot_source(name).keys.urdf.startswith("package:mani_skill/")
-            if from_sim or not EXTRAS["robots"].missing():  # the line of the extra says that it is missing
-                code = ROBOT.format(name=name)
-                yield Check(f"robot {name}", partial(_probe, code), f"Use another --robot, or: {again}")
-        fix = f"Plan labels need no physics. See the libraries and robots above, or: {again}"
+        fix = f"See the libraries above, or: {_AGAIN} numba coal mani-skill sapien"
         yield Check("sim labels", partial(_probe, LABELS.format(source="sim")), fix)
 
 
@@ -239,15 +232,6 @@ RAY = """
 import importlib
 ray = importlib.import_module("ray")
 print("ray " + ray.__version__)
-"""
-ROBOT = """
-from datagen.workers.robots import open_robot, robot_limits
-limits = robot_limits({name!r})
-robot = open_robot({name!r}, limits.reach_m[1], (limits.base_height_m or (0.5,))[0])
-home = robot.homes_rad[0]
-assert not robot.collides_itself(home), "the first tucked pose touches itself"
-hand = robot.gripper
-print(f"{{len(home)}} joints, reach {{robot.reach_m:.3f}} m, hand opens {{hand.max_opening_m:.3f}} m")
 """
 # Several times the usual duration: code may be compiled and grasps computed for the first time.
 _DEADLINE_S = 600.0

@@ -12,7 +12,6 @@ import shutil
 import tarfile
 import tempfile
 import zipfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
@@ -116,16 +115,6 @@ def fetch(
     with whole_file(folder / LOCK_NAME, durable=True) as file:
         file.write(json.dumps(lock.model_dump(), indent=1, sort_keys=True).encode() + b"\n")
     return Fetched(asset.name, digest, size, entry.trust, from_cache, files)
-
-
-def refuse_full_disk(assets: Sequence[CatalogueEntry], folder: Path) -> None:
-    """Raise InputError where the disk has no room for the known sizes."""
-    known = sum(asset.size or 0 for asset in assets)
-    existing = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
-    free = shutil.disk_usage(existing).free
-    if known > free:
-        problem = f"{known:,} bytes are needed and {free:,} are free"
-        raise InputError(folder, "", problem, "Free some space, or use another disk")
 
 
 def _install(asset: CatalogueEntry, kept: Path, folder: Path) -> int:
