@@ -22,7 +22,7 @@ from datagen.assets.catalogue import CatalogueEntry
 from datagen.assets.download import Progress, download
 from datagen.schemas.errors import InputError
 from datagen.schemas.run_records import Digest, StoredRecord
-from datagen.schemas.safe_files import DAMAGED_ZIP, open_regular, read_regular, whole_file
+from datagen.schemas.safe_files import DAMAGED_ZIP, is_inside, open_regular, read_regular, whole_file
 from datagen.workers.source_statement import STATEMENT
 
 LOCK_NAME = "assets.lock.json"
@@ -131,7 +131,7 @@ def unpack(archive: Path, folder: Path) -> int:
     """Unpack the files of a zip or tar into `folder`, over those of the same names; return their number.
 
     They are moved when the whole archive is unpacked, so that a damaged one leaves nothing. No name leads out
-    of the folder. Raises InputError for an archive that is damaged or has devices or links to elsewhere.
+    of the folder, and links and devices are left out. Raises InputError for a damaged archive.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".unpack-", dir=folder) as staging:
@@ -140,17 +140,27 @@ def unpack(archive: Path, folder: Path) -> int:
                 with zipfile.ZipFile(archive) as packed:
                     packed.extractall(staging)
             else:
-                with tarfile.open(archive) as packed:
-                    packed.extractall(staging, filter="data")
+                _unpack_tar(archive, Path(staging))
         except (tarfile.TarError, *DAMAGED_ZIP) as error:
             fix = "Remove it from the cache and fetch it again"
             raise InputError(archive, "", f"cannot be unpacked: {error}", fix) from error
-        files = [path for path in Path(staging).rglob("*") if path.is_file() and not path.is_symlink()]
+        files = [path for path in Path(staging).rglob("*") if path.is_file()]
         for file in files:
             target = folder / file.relative_to(staging)
             target.parent.mkdir(parents=True, exist_ok=True)
             file.replace(target)
     return len(files)
+
+
+def _unpack_tar(archive: Path, folder: Path) -> None:
+    # Not by extractall, whose filter for names that lead out came with Python 3.11.4.
+    with tarfile.open(archive) as packed:
+        for member in packed:
+            target = folder / member.name
+            if member.isreg() and is_inside(folder, target) and (source := packed.extractfile(member)):
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with target.open("wb") as file:
+                    shutil.copyfileobj(source, file)
 
 
 def _state(asset: CatalogueEntry, home: Path) -> None:

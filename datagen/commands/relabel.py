@@ -72,6 +72,6 @@ def relabel(
     with resumable(words):
         done = replace(relabel_run(storage, source, spec, json), path=out, resume=tuple(words))
     code = print_job(done, json=json)
-    if done.remaining and not json and done.end != "interrupted":
+    if done.remaining and not json and done.end == "complete":
         print_lines(f"{counted(done.remaining, 'shard')} that {run} lacks: make them, then relabel again")
     return code

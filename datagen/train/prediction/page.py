@@ -68,19 +68,19 @@ def page_of(prediction: Prediction) -> str:
         full_html=False, div_id="prediction", default_height="min(40rem, 120vw)",
         config={"responsive": True, "displaylogo": False},
     )  # fmt: skip
-    title = _text(f"Base poses scored by {prediction.scorer}")
-    rows = ((head, _text(text)) for head, text in report_rows(prediction))
+    title = escaped(f"Base poses scored by {prediction.scorer}")
+    rows = ((head, escaped(text)) for head, text in report_rows(prediction))
     # A text without a heading belongs to the one above.
-    facts = "".join((f"<dt>{_text(head)}</dt>" if head else "") + f"<dd>{text}</dd>" for head, text in rows)
+    facts = "".join((f"<dt>{escaped(head)}</dt>" if head else "") + f"<dd>{text}</dd>" for head, text in rows)
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{title}</title><style>{_STYLE}</style></head>\n<body>\n<h1>{title}</h1>\n<dl>{facts}</dl>\n"
-        f'<figure tabindex="0">{view}<figcaption>{_text(_CAPTION)}</figcaption></figure>\n</body></html>\n'
+        f'<figure tabindex="0">{view}<figcaption>{escaped(_CAPTION)}</figcaption></figure>\n</body></html>\n'
     )
 
 
-def _text(text: str) -> str:
+def escaped(text: str) -> str:
     """The text escaped for HTML, without markup or control characters."""
     return escape(printable(text))
 

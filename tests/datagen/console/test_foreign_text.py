@@ -10,6 +10,7 @@ from datagen import cli
 from datagen.console.printing import print_lines, print_rows
 from datagen.schemas.jobs import JobRecord, Jobs, JobState
 from datagen.schemas.run_records import LedgerEntry
+from datagen.train.prediction.page import escaped
 from tests.made_runs import give_up, make_run
 
 # A colour, the clipboard (OSC 52), a bell, a carriage return, C1 controls, text that runs backwards, markup.
@@ -77,6 +78,10 @@ def test_tables_take_brackets_for_brackets(capsys: pytest.CaptureFixture[str]) -
     told = capsys.readouterr().out
     assert "a [red]b[/red]" in told and "[/]" in told and "[bold]head" in told
     assert all(c.isprintable() or c == "\n" for c in told)
+
+
+def test_a_page_shows_what_it_is_given() -> None:
+    assert escaped(EVIL).isprintable() and "<" not in escaped(EVIL) and "\\u202e" in escaped(EVIL)
 
 
 def test_lines_keep_their_breaks(capsys: pytest.CaptureFixture[str]) -> None:
