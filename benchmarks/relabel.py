@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from datagen.relabelling import relabel_run, relabelled_specification
+from datagen.jobs.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import open_storage
@@ -40,8 +40,8 @@ def main() -> None:
         again = relabelled_specification(source, {"heuristic.mu": 0.6})
         done = relabel_run(open_storage(Path(folder) / "again"), source, again)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        assert done.summary.remaining == 0
-        _print(done.run, options.samples, wall, cpu)
+        assert done.remaining == 0
+        _print(Run.open(done.path), options.samples, wall, cpu)
 
 
 def _print(run: Run, samples: int, wall_s: float, cpu_s: float) -> None:

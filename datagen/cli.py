@@ -24,7 +24,7 @@ from cyclopts.exceptions import (
 )
 
 from datagen import __version__
-from datagen.cluster.ray_settings import ENDING_RAY, job_environment
+from datagen.cluster.ray_settings import ENDING_RAY
 from datagen.console.command_lines import PRINTER, Interrupted, begin_with_process
 from datagen.console.printing import drop_output
 from datagen.display.progress import LossyStream
@@ -57,7 +57,6 @@ _HEADINGS: dict[str, dict[str, tuple[str, str]]] = {
         "show": ("datagen.commands.show:show", "Draw a picture of one scene of a run."),
         "view": ("datagen.commands.view:view", "Open scenes of a run in the viewer Rerun."),
         "audit": ("datagen.commands.audit:audit", "Show the cost of labels by stage."),
-        "report": ("datagen.commands.report:report", "Write one HTML page about runs and models."),
         "export": ("datagen.commands.export:export", "Write a run in the format of another program."),
     },
     "Check runs": {
@@ -228,8 +227,7 @@ def main() -> None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
     sys.stderr = LossyStream(sys.stderr)
     begin_with_process()
-    with job_environment():
-        code = run(sys.argv[1:])
+    code = run(sys.argv[1:])
     if any(thread.name == ENDING_RAY for thread in threading.enumerate()):
         os._exit(code)  # the end of the interpreter would wait for Ray's stopped servers too
     sys.exit(code)

@@ -134,7 +134,7 @@ MODELS=("$OUT"/models/{stage1,sim-only,stage2,sim-only-quarter,stage2-quarter}.c
 FITTED=(--fit "$OUT/runs/val-in-range" --fit "$OUT/runs/val-clear" --heuristic "$OUT/rule.toml")
 if ! made_after "$OUT/tables.json" "${MODELS[@]}" "$OUT/rule.toml"; then
     step "evaluate"
-    datagen evaluate "${MODELS[@]}" "$OUT"/runs/test-{in-range,grid} "${FITTED[@]}" \
-        --out "$OUT/tables.html" --out "$OUT/tables.json"
+    datagen evaluate "${MODELS[@]}" "$OUT"/runs/test-{in-range,grid} "${FITTED[@]}" --full \
+        --out "$OUT/tables.json" | tee "$OUT/tables.txt"
 fi
-step "done: tables.html, tables.json and rule.toml in $OUT"
+step "done: tables.txt, tables.json and rule.toml in $OUT"

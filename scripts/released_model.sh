@@ -47,5 +47,5 @@ step "the benchmark's runs"
 datagen benchmark make --houses "procthor:$ASSETS/procthor" --objects "ycb:$ASSETS/ycb" --out runs
 step scores
 [ board.json -nt model.ckpt ] || datagen benchmark score model.ckpt scalars reachability reach-share distance proximity \
-    --runs runs --fit val --out board.json --out board.html
+    --runs runs --fit val --out board.json
 step "all is done"

@@ -33,12 +33,17 @@ _PART_BYTES = 2**16
 _HOP = ("connection", "keep-alive", "transfer-encoding", "content-length", "date", "server")
 
 
+def free_port() -> int:
+    """A free port of the loopback address."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
 @contextmanager
 def moto_server(log: Path) -> Generator[int]:
     """moto's S3 server in a process of its own; its port."""
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        port = s.getsockname()[1]
+    port = free_port()
     with log.open("wb") as out:
         command = [sys.executable, "-c", _MOTO, "-H", "127.0.0.1", "-p", str(port)]
         process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)

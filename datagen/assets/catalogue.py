@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 from datagen.schemas.errors import InputError, choices
 
-_GB = 10**9
 _PROCTHOR_10K = "439193522244720b86d8c81cde2e51e3a4d150cf"
 _PROCTHOR = "53d5bd4c8c96a699e6a615dc390abb670cc9d353"
 _YCB_SCANS = "https://ycb-benchmarks.s3.amazonaws.com/data/google"
@@ -41,8 +40,6 @@ class CatalogueEntry:
     title: str = ""  # with `attribution` and `licence`, what the folder `holds` states of itself
     attribution: str = ""
     holds: str = ""  # subfolder of the target; "" for `into`
-    max_bytes: int = _GB
-    max_unpacked_bytes: int = 10 * _GB
 
 
 def _houses(split: str, sha256: str, size: int) -> CatalogueEntry:
@@ -88,7 +85,6 @@ _ALL = (
         holds="mani_skill2_ycb",
         sha256="1551724fd1ac7bad9807ebcf46dd4a788caed5c9499c1225b9bfa080ffbefcb3",
         archive=True,
-        max_bytes=4 * _GB,
     ),
     _houses("train", "ee3c4aa14b4d8f0895fecfb5fdaca59395427ca1018b2f9aeeedbc61e5824587", 53_314_510),
     _houses("val", "d808540514e26b6726cd2790490e669b572eeb94febb5188a2f403591dd21721", 5_094_681),
@@ -112,8 +108,6 @@ _ALL = (
         attribution=_KOLVE,
         holds="ai2thor",
         archive=True,
-        max_bytes=60 * _GB,
-        max_unpacked_bytes=200 * _GB,
     ),
     *(
         CatalogueEntry(
@@ -126,8 +120,6 @@ _ALL = (
             title="YCB objects",
             attribution=_CALLI,
             archive=True,
-            max_bytes=200 * 10**6,
-            max_unpacked_bytes=_GB,
         )
         for key in _SCANNED
     ),

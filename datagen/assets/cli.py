@@ -8,7 +8,7 @@ from pathlib import Path
 from cyclopts import App
 
 from datagen.assets.catalogue import CATALOGUE, select
-from datagen.assets.fetch import Fetched, fetch, refuse_full_disk
+from datagen.assets.fetch import Fetched, fetch
 from datagen.assets.object_split import split_objects
 from datagen.console.options import AsJson, refuse_output
 from datagen.console.printing import print_json, print_lines, print_rows, size
@@ -117,7 +117,6 @@ def fetch_assets(
         fix = choices({name.split("/")[0] for name in CATALOGUE})
         raise InputError("datagen assets fetch", "NAME", "is missing", fix)
     chosen = select(names)
-    refuse_full_disk(chosen, out)
     results: list[Fetched] = []
     with Progress(json) as shown:
         for asset in chosen:

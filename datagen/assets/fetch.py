@@ -9,7 +9,9 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Sequence
+import tarfile
+import tempfile
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
@@ -17,11 +19,10 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationError
 
 from datagen.assets.catalogue import CatalogueEntry
-from datagen.assets.download import DownloadPolicy, Progress, download
-from datagen.assets.unpack import Limits, unpack
+from datagen.assets.download import Progress, download
 from datagen.schemas.errors import InputError
 from datagen.schemas.run_records import Digest, StoredRecord
-from datagen.schemas.safe_files import open_regular, read_regular, whole_file
+from datagen.schemas.safe_files import DAMAGED_ZIP, is_inside, open_regular, read_regular, whole_file
 from datagen.workers.source_statement import STATEMENT
 
 LOCK_NAME = "assets.lock.json"
@@ -79,7 +80,6 @@ def fetch(
     cache: Path,
     mirror: str | None = None,
     progress: Progress = lambda here, total: None,
-    policy: DownloadPolicy | None = None,
 ) -> Fetched:
     """Download one asset, or take it from the cache, unpack it and record it in the lock file.
 
@@ -97,9 +97,7 @@ def fetch(
             kept,
             sha256=expected,
             size=asset.size,
-            max_bytes=asset.max_bytes,
             progress=progress,
-            policy=policy,
         )
     size = kept.stat().st_size
     files = _install(asset, kept, folder)
@@ -119,24 +117,50 @@ def fetch(
     return Fetched(asset.name, digest, size, entry.trust, from_cache, files)
 
 
-def refuse_full_disk(assets: Sequence[CatalogueEntry], folder: Path) -> None:
-    """Raise InputError where the disk has no room for the known sizes."""
-    known = sum(asset.size or 0 for asset in assets)
-    existing = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
-    free = shutil.disk_usage(existing).free
-    if known > free:
-        problem = f"{known:,} bytes are needed and {free:,} are free"
-        raise InputError(folder, "", problem, "Free some space, or use another disk")
-
-
 def _install(asset: CatalogueEntry, kept: Path, folder: Path) -> int:
     """Copy or unpack the download; return the number of its files."""
     home = folder / PurePosixPath(asset.into)
     if asset.archive:
-        return len(unpack(kept, home, Limits(asset.max_unpacked_bytes)))
+        return unpack(kept, home)
     with kept.open("rb") as source, whole_file(home / asset.file, alone=True) as file:
         shutil.copyfileobj(source, file)
     return 1
+
+
+def unpack(archive: Path, folder: Path) -> int:
+    """Unpack the files of a zip or tar into `folder`, over those of the same names; return their number.
+
+    They are moved when the whole archive is unpacked, so that a damaged one leaves nothing. No name leads out
+    of the folder, and links and devices are left out. Raises InputError for a damaged archive.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".unpack-", dir=folder) as staging:
+        try:
+            if zipfile.is_zipfile(archive):
+                with zipfile.ZipFile(archive) as packed:
+                    packed.extractall(staging)
+            else:
+                _unpack_tar(archive, Path(staging))
+        except (tarfile.TarError, *DAMAGED_ZIP) as error:
+            fix = "Remove it from the cache and fetch it again"
+            raise InputError(archive, "", f"cannot be unpacked: {error}", fix) from error
+        files = [path for path in Path(staging).rglob("*") if path.is_file()]
+        for file in files:
+            target = folder / file.relative_to(staging)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            file.replace(target)
+    return len(files)
+
+
+def _unpack_tar(archive: Path, folder: Path) -> None:
+    # Not by extractall, whose filter for names that lead out came with Python 3.11.4.
+    with tarfile.open(archive) as packed:
+        for member in packed:
+            target = folder / member.name
+            if member.isreg() and is_inside(folder, target) and (source := packed.extractfile(member)):
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with target.open("wb") as file:
+                    shutil.copyfileobj(source, file)
 
 
 def _state(asset: CatalogueEntry, home: Path) -> None:

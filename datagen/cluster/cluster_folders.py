@@ -8,14 +8,13 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import tempfile
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
 
-from datagen.schemas.safe_files import locked_folder, whole_file
+from datagen.schemas.safe_files import locked_folder
 
 _PARENT = Path("/tmp")  # sockets need a short path
 _KIND = "datagen-ray-"
@@ -36,17 +35,6 @@ def private_folder() -> Generator[Path]:
     with locked_folder(_KIND, _PARENT, remove_folder) as folder:
         (folder / RAY).mkdir()
         yield folder
-
-
-def new_folder(kind: str) -> Path:
-    """A new folder below /tmp with mode 0700; its name begins with `kind`."""
-    return Path(tempfile.mkdtemp(prefix=kind, dir=_PARENT))
-
-
-def write_private(path: Path, text: str) -> None:
-    """Write a file of mode 0600 atomically."""
-    with whole_file(path, mode=0o600) as file:
-        file.write(text.encode())
 
 
 def remove_folder(folder: Path) -> None:

@@ -18,8 +18,6 @@ from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, JobState, new_job_id
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.storage.errors import StoreUnavailable
 
-# Environment variables of a detached job: its submission id at Ray, and the address of Ray's Jobs API.
-SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"
 BEAT_S, LOOK_S = 10.0, 3.0  # between two states, and between two looks for a request to stop
 NOTES_S = 1.0  # between two looks at the progress of running attempts
 
@@ -153,8 +151,6 @@ class JobRecorder:
             pid=os.getpid(),
             started=utc_now(),
             address=address,
-            submission=os.environ.get(SUBMISSION, ""),
-            jobs_api=os.environ.get(JOBS_API, ""),
         )
         self._before = JobTotals(0)  # sums over the finished runs
         self._state = JobState(id=record.id, updated=record.started, phase="starting", shards=shards)

@@ -1,15 +1,9 @@
-"""Environment of Ray processes and of detached jobs: loopback address, token, and the shell's variables.
-
-A detached job gets secrets in a file that only its user can read, since Ray shows a runtime environment on
-command lines and in logs; the job's driver and workers read it when they start. This module does not import
-Ray, so that it can be used to run `ray start` as a program."""
+"""Environment of Ray processes: loopback address, token and numbers of threads."""
 
 from __future__ import annotations
 
-import json
 import os
 import secrets
-import socket
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -71,63 +65,8 @@ def token_environment(token: str) -> dict[str, str]:
     return {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": token, "RAY_AUTH_TOKEN_PATH": ""}
 
 
-def head_arguments(workers: int) -> list[str]:
-    """Arguments of `ray` to start the head of a local cluster, with dashboard and jobs.
-
-    Port 0 selects a free one, which Ray prints. Use with `head_environment`, without which Ray would listen
-    on every interface.
-    """
-    return [
-        "start",
-        "--head",
-        "--node-ip-address=127.0.0.1",
-        "--port=0",
-        "--include-dashboard=true",
-        "--dashboard-host=127.0.0.1",
-        "--dashboard-port=0",
-        "--dashboard-agent-listen-port=0",
-        # Fixed by default: two heads on one machine would share the port and each other's clients.
-        f"--ray-client-server-port={free_port()}",
-        f"--num-cpus={workers}",
-        f"--object-store-memory={OBJECT_STORE_BYTES}",
-        "--disable-usage-stats",
-    ]
-
-
-def free_port() -> int:
-    """A free port of the loopback address."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-# Path of the file, for a detached job.
-JOB_ENVIRONMENT = "DATAGEN_JOB_ENVIRONMENT"
 # Name of the thread that disconnects from Ray. Where it is left behind, the interpreter's end would wait too.
 ENDING_RAY = "ending Ray"
-_OF_THE_SHELL = ("AWS_", "DATAGEN_", "XDG_CACHE_HOME")
-
-
-def is_of_the_shell(name: str) -> bool:
-    """Whether a detached job gets this variable from the submitting shell, not from Ray's head."""
-    return name.startswith(_OF_THE_SHELL)
-
-
-def adopt_job_environment() -> None:
-    """Set the variables of a detached job; Ray calls it in each worker of the job."""
-    if named := os.environ.get(JOB_ENVIRONMENT):
-        os.environ.update(json.loads(Path(named).read_text()))
-
-
-@contextmanager
-def job_environment() -> Generator[None]:
-    """Set the variables of a detached job, and remove their file when the block ends."""
-    adopt_job_environment()
-    try:
-        yield
-    finally:
-        if named := os.environ.get(JOB_ENVIRONMENT):
-            Path(named).unlink(missing_ok=True)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""`datagen benchmark`: make the runs of the frozen benchmark, pack them, and score methods on them."""
+"""`datagen benchmark`: make the runs of the frozen benchmark, and score methods on them."""
 
 from __future__ import annotations
 
@@ -16,15 +16,13 @@ from datagen.console.command_lines import (
     prints,
     words_of,
 )
-from datagen.console.options import AsJson, PathOrAddress, PathsOrAddresses, Whole
+from datagen.console.options import AsJson, File, PathOrAddress, PathsOrAddresses, Whole
 from datagen.console.printing import print_rows
-from datagen.evaluation.output import Outputs, output_files, print_report, write_report
+from datagen.evaluation.output import output_file, print_report, write_report
 from datagen.jobs.job import JobOptions
 from datagen.jobs.job_report import print_job
 
-app = App(
-    name="benchmark", help="Make the runs of the frozen benchmark, pack them, and score methods on them."
-)
+app = App(name="benchmark", help="Make the runs of the frozen benchmark, and score methods on them.")
 
 
 @app.command
@@ -80,40 +78,6 @@ def make(
 
 
 @app.command
-def pack(
-    *,
-    runs: PathOrAddress,
-    out: Path,
-    scenes: Whole = 100,
-    without_labels: bool = False,
-) -> int:
-    """Pack the first scenes of the benchmark's runs, one small file a run, with a definition of their own.
-
-    `score --runs OUT` and any Zarr reader open a pack. Equal runs give equal bytes.
-
-    For example: datagen benchmark pack --runs runs --out pack
-
-    Args:
-        runs: Folder with the runs of `datagen benchmark make`; those that it lacks are not packed.
-        out: New folder for the pack.
-        scenes: Scenes of all runs together, of which each has an equal share.
-        without_labels: Keep the labels back; `score` refuses such a pack.
-    """
-    from datagen.evaluation.benchmark import present_runs, read_benchmark, refuse_differing, write_pack
-
-    definition = read_benchmark(None if "://" in str(runs) else Path(runs))
-    paths = present_runs(str(runs), definition)
-    for name, path in paths.items():
-        refuse_differing(path, name, definition.runs[name], definition.version)
-    rows = [
-        (file.name, f"{run.n:,} candidates, {file.stat().st_size:,} bytes")
-        for file, run in write_pack(paths, definition, out, scenes, not without_labels)
-    ]
-    print_rows(f"pack of benchmark {definition.version} in {out}", rows)
-    return 0
-
-
-@app.command
 @prints(print_report)
 def score(
     methods: Annotated[Sequence[str], Parameter(name="METHOD...")],
@@ -121,7 +85,7 @@ def score(
     *,
     runs: PathOrAddress | None = None,
     fit: PathsOrAddresses | None = None,
-    out: Outputs = None,
+    out: File | None = None,
     json: AsJson = False,
 ) -> dict[str, Any]:
     """Score methods on the benchmark's runs, and print the report.
@@ -129,14 +93,14 @@ def score(
     A METHOD is `released`, a checkpoint, a CSV file of scores, or the name of a baseline. A run that is not
     the benchmark's is refused with its differences.
 
-    For example: datagen benchmark score released mine.csv scalars --runs runs --fit val --out board.html
+    For example: datagen benchmark score released mine.csv scalars --runs runs --fit val --out board.json
 
     Args:
         methods: Methods to compare.
         runs: Folder with the runs of `datagen benchmark make`, or a pack; runs that it lacks are not scored.
             [default: the pack that comes with datagen]
         fit: Run in validation houses to fit baselines on; repeat for more.
-        out: File to write, .json or .html; repeat for both.
+        out: File to write, FILE.json.
     """
     from datagen.evaluation.benchmark import (
         present_runs,
@@ -149,7 +113,7 @@ def score(
     from datagen.evaluation.report import Part, evaluation_report, parts_by_place, parts_of_grids
     from datagen.evaluation.runs import open_evaluated_runs
 
-    files = output_files(out)
+    file = output_file(out)
     folder = str(shipped_pack() if runs is None else runs)
     definition = read_benchmark(None if "://" in folder else Path(folder))
     paths = present_runs(folder, definition)
@@ -172,5 +136,5 @@ def score(
     report = evaluation_report(seconds, compared, opened, parts, [Path(p).name for p in fitted_on], {})
     report["runs"] = [{**each, "place": name} for each, name in zip(report["runs"], wanted, strict=True)]
     report["benchmark"] = definition.record(wanted)
-    write_report(report, columns, files)
+    write_report(report, file)
     return report

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 from datagen.console.command_lines import interruptible, print_interrupted, prints
 from datagen.console.options import AS_FOUND, AsJson, AssetSources, File, PathsOrAddresses, Whole
-from datagen.evaluation.output import Outputs, output_files, print_report, write_report
+from datagen.evaluation.output import output_file, print_report, write_report
 from datagen.schemas.errors import InputError
 
 _MOST_WORKERS = 256
@@ -32,7 +32,7 @@ def evaluate(
     workers: Whole | None = None,
     given: AssetSources = AS_FOUND,
     allow_seen_houses: bool = False,
-    out: Outputs = None,
+    out: File | None = None,
     full: bool = False,
     json: AsJson = False,
 ) -> dict[str, Any]:
@@ -46,19 +46,19 @@ def evaluate(
     there. Outcomes are kept next to the output: after Ctrl-C, or with more methods, the same command makes
     only the missing ones.
 
-    For example: datagen evaluate model.ckpt runs/sim-test --out report.html
+    For example: datagen evaluate model.ckpt runs/sim-test --out report.json
 
     Args:
         paths: Checkpoints of `datagen train`, or `released`, and runs of sim or plan labels.
         fit: Run in validation houses to fit baselines on; repeat for more.
         baselines: Baseline to compare with, or none; repeat for more. [default: all]
         heuristic: Parameters of the analytic baseline, from `datagen calibrate`.
-        arrival: Arrival error: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv. [default: 0 to 25 cm]
+        arrival: Arrival error: normal:M[,YAW], disc:M[,YAW] or nav2. [default: 0 to 25 cm]
         closed_loop: Scenes of the closed loop, the first whole grids with a good base pose. [default: 0]
         execute: Execute the plans of the closed loop in disturbed physics, which takes most of the time.
         workers: Processes of the closed loop; 0: this process, for debuggers. [default: cores]
         allow_seen_houses: Report training houses separately instead of failing.
-        out: File to write, .json or .html; repeat for both.
+        out: File to write, FILE.json.
         full: Print all tables and notes.
 
     Returns:
@@ -84,10 +84,9 @@ def evaluate(
     from datagen.evaluation.runs import candidate_sets_of, open_evaluated_runs, split_paths
     from datagen.train.arrivals import read_arrival
 
-    files = output_files(out)
+    file = output_file(out)
     arrivals = [read_arrival(text) for text in arrival or ()]
-    if closed_loop:
-        _refuse_bad_loop(closed_loop, execute, workers, files)
+    kept = _kept_outcomes(closed_loop, execute, workers, file) if closed_loop else ""
     checkpoints, run_paths = split_paths([str(path) for path in paths])
     runs = open_evaluated_runs(run_paths)
     models = open_models(checkpoints, runs)
@@ -108,20 +107,20 @@ def evaluate(
         from datagen.evaluation.arrival_outcomes import PLAN, SIM, make_all
         from datagen.evaluation.closed_loop import loop_record, plan_loop
 
-        kept, mode = files[0].with_suffix(".arrivals"), SIM if execute else PLAN
         judged = [method.method for method in methods]
-        loop = plan_loop(columns, runs, given, judged, arrivals, closed_loop, mode, str(kept))
+        loop = plan_loop(columns, runs, given, judged, arrivals, closed_loop, SIM if execute else PLAN, kept)
         processes = len(os.sched_getaffinity(0)) if workers is None else workers
         with interruptible() as stopping:
             if not make_all(loop.tasks, processes, stopping, json):
                 print_interrupted("; finished arrivals are kept", sys.argv[1:])
                 raise KeyboardInterrupt
         report["closed_loop"] = loop_record(loop, judged)
-    write_report(report, columns, files)
+    write_report(report, file)
     return report
 
 
-def _refuse_bad_loop(scenes: int, execute: bool, workers: int | None, files: Sequence[Path]) -> None:
+def _kept_outcomes(scenes: int, execute: bool, workers: int | None, file: Path | None) -> str:
+    """The folder of a closed loop's outcomes, next to the output."""
     from datagen.configuration.robot_fields import refuse_missing_packages
 
     for option, value, least, most in (
@@ -130,7 +129,8 @@ def _refuse_bad_loop(scenes: int, execute: bool, workers: int | None, files: Seq
     ):
         if not least <= value <= most:
             raise InputError(option, str(value), f"is not from {least} to {most:,}", "Give another number")
-    if not files:
-        fix = "Give --out FILE.html: its outcomes are kept in a folder next to it"
+    if file is None:
+        fix = "Give --out FILE.json: its outcomes are kept in a folder next to it"
         raise InputError("--closed-loop", "--out", "is missing", fix)
     refuse_missing_packages("sim" if execute else "plan")
+    return str(file.with_suffix(".arrivals"))

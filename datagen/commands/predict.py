@@ -140,7 +140,7 @@ class PredictOptions:
         allow_unseen: Also consider cells of which the floor, or the way there, was not seen.
         map: Map of the floor, map.yaml as Nav2 has it, in which the frames have their poses; repeatable.
         keep_out: Map of which no base may stand on occupied cells, FILE.yaml.
-        arrival: Arrival error to choose for: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv.
+        arrival: Arrival error to choose for: normal:M[,YAW], disc:M[,YAW] or nav2.
         out: Picture to write, FILE.png, .pdf or .svg.
         html: Page to write, FILE.html.
         goal: Goal for the robot's base to write, FILE.yaml or .mcap; FILE.pgm: the scores as a map.

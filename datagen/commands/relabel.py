@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
-import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from datagen.console.command_lines import command_line, print_interrupted
+from datagen.console.command_lines import resumable
 from datagen.console.options import AsJson, RunPath
-from datagen.console.printing import counted, new_labels, print_json, print_rows, seconds, summary_of_stored
-from datagen.relabelling import Relabelled, relabel_run, relabelled_specification
+from datagen.console.printing import counted, print_lines
+from datagen.jobs.job_report import print_job
+from datagen.jobs.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
-from datagen.schemas.storage import Storage, open_storage
+from datagen.schemas.storage import open_storage
 
 
 def relabel(
@@ -68,46 +68,10 @@ def relabel(
         problem = "has these parameters already"
         raise InputError(run, "heuristic", problem, "Give another parameter, such as --tau, or --config")
     storage = open_storage(out)
-    started_s = time.monotonic()
-    done = relabel_run(storage, source, spec, json)
-    return _report(run, out, storage, done, time.monotonic() - started_s, json)
-
-
-def _report(run: str, out: str, storage: Storage, done: Relabelled, elapsed_s: float, json: bool) -> int:
-    summary, labels, positives = done.summary, done.summary.totals.labels, done.summary.totals.positives
-    report = {
-        "run": storage.url,
-        "source": run,
-        "end": summary.end,
-        "spec_hash": done.run.manifest.spec_hash,
-        "labels": labels,
-        "wanted": done.run.n,
-        "positives": positives,
-        "now_good": done.flips.to_good,
-        "now_bad": done.flips.to_bad,
-        "shards_to_come": done.absent,
-        "seconds": round(elapsed_s, 3),
-    }
-    with summary_of_stored():
-        if json:
-            print_json(report)
-        else:
-            rows = [
-                ("labels", new_labels(labels, done.run.n) if labels else "nothing to do"),
-                ("positive", f"{100 * positives / labels:.1f}%" if labels else "-"),
-                ("changed", f"{done.flips.to_good:,} labels became positive, {done.flips.to_bad:,} negative"),
-                ("time", seconds(elapsed_s)),
-            ]
-            if done.absent:
-                absent = counted(done.absent, "shard")
-                rows.append(("to come", f"{absent} that {run} lacks: make them, then relabel again"))
-            print_rows(f"{summary.end}: {out}", rows)
-    if summary.end == "aborted":
-        raise InputError(
-            out, "", f"cannot continue: {summary.cause}", f"Then run again: {command_line(sys.argv[1:])}"
-        )
-    if summary.end == "failed":
-        sys.stderr.write(f"error: {out}: too many shards failed. See: datagen status {shlex.quote(out)}\n")
-    if summary.end == "interrupted":
-        print_interrupted(f"; {counted(summary.remaining, 'shard')} left", sys.argv[1:])
-    return summary.exit_code
+    words = sys.argv[1:]
+    with resumable(words):
+        done = replace(relabel_run(storage, source, spec, json), path=out, resume=tuple(words))
+    code = print_job(done, json=json)
+    if done.remaining and not json and done.end == "complete":
+        print_lines(f"{counted(done.remaining, 'shard')} that {run} lacks: make them, then relabel again")
+    return code

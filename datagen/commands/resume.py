@@ -20,7 +20,7 @@ from datagen.console.command_lines import (
 )
 from datagen.console.options import LABELLED, RUN, Sources, Whole, option
 from datagen.console.printing import counted
-from datagen.jobs.detach import detach_job, in_ray_job
+from datagen.jobs.detach import detach_job
 from datagen.jobs.job import Job, JobOptions, JobRun, refuse_odd_n
 from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.start_job import open_job_run, with_absolute_paths, words_to_resume
@@ -72,9 +72,6 @@ def resume(options: ResumeOptions) -> JobResult:
         refuse_odd_n(options.n)
     options = with_absolute_paths(options)
     words = ["resume", absolute_path(path), *words_of(given_options(options))]
-    if options.detach and options.address != "local":  # the run and its sources are paths on the cluster
-        words = ["resume", absolute_path(path), *words_of(given_options(in_ray_job(options)))]
-        return detach_job(words, path, options)
     again = words_to_resume(path, options, options)
     with resumable(again):
         with options.display() as shown:
@@ -88,7 +85,7 @@ def resume(options: ResumeOptions) -> JobResult:
             if not options.quiet:
                 sys.stderr.write(f"out of quarantine: {counted(lifted, 'shard')}\n")
     if options.detach:
-        return detach_job(words_to_resume(path, in_ray_job(options), options), path, options)
+        return detach_job(again, path)
     return Job(storage, path, job_runs, options, began_s, words, again).run()
 
 

@@ -148,8 +148,6 @@ def _job_events(storage: Storage) -> list[Event]:
     for job in Jobs(storage).all():
         record, state = job.record, job.state
         where = f"on {record.host}, process {record.pid}"
-        if record.submission:
-            where += f", submitted to Ray as {record.submission}"
         text = f"job {job.id} began {where}: {' '.join(record.command)}"
         events.append(Event(record.started, "job_began", text))
         if state is not None and state.end:

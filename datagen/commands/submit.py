@@ -27,7 +27,7 @@ from datagen.console.command_lines import (
 )
 from datagen.console.options import LABELLED, ROBOT, RUNNING, Whole, option
 from datagen.display.progress import Progress
-from datagen.jobs.detach import detach_job, in_ray_job
+from datagen.jobs.detach import detach_job
 from datagen.jobs.job import Job, JobOptions, JobRun, refuse_odd_n
 from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.start_job import (
@@ -168,14 +168,9 @@ def submit(options: SubmitOptions) -> JobResult:
     refuse_missing_packages(label_source)
     load_label_source(label_source)  # InputError for an unknown one
     refuse_odd_n(options.n)
-    if options.dry_run and options.detach:
-        raise InputError("--dry-run", "--detach", "makes nothing that could be detached", "Omit one of them")
     options.refuse_bad()
     options = with_absolute_paths(options)
     words = ["submit", label_source, *words_of(given_options(replace(options, dry_run=False)))]
-    if options.detach and options.address != "local":  # its sources are paths on the cluster
-        words = ["submit", label_source, *words_of(given_options(in_ray_job(options)))]
-        return detach_job(words, path, options)
     with options.display() as shown:
         shown.phase("opening houses and objects")
         run, manifest, surveys = _specified(options, shown)
@@ -189,12 +184,12 @@ def submit(options: SubmitOptions) -> JobResult:
         run = Run.create_or_open(open_storage(path), manifest, options.n)
     else:
         run.grow(options.n)
+    again = words_to_resume(path, options)
     if options.detach:
-        return detach_job(words_to_resume(path, in_ray_job(options)), path, options)
+        return detach_job(again, path)
     sources = manifest.sources
     more = sources.get("scenes_from", ""), sources.get("robot", "")
     job_run = JobRun(run, sources["houses"], sources["objects"], *more)
-    again = words_to_resume(path, options)
     return Job(run.storage, path, [job_run], options, began_s, words, again).run()
 
 

@@ -1,33 +1,29 @@
-"""Figures: sheets as PNG, drawings of pages as SVG, frames with outlined targets, lines of facts."""
+"""Sheets of figures, frames with outlined targets, lines of facts."""
 
 from __future__ import annotations
 
 import io
 import textwrap
-from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
-import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from PIL import Image
 
 from datagen.display.styles import TARGET
-from datagen.schemas.errors import printable
 
 _WIDTH_IN = 11.0  # at 800 pixels, as pages show pictures, text of 10 points is then 10 pixels high
 _DPI = 120
 _LINE_IN, _TEXT_POINTS = 0.19, 68  # of facts: height of a line, and where texts begin
-_MOST_CHARACTERS = 60  # in a name: a longer one leaves no room for axes
 
 
 def new_sheet(title: str, height_in: float) -> Figure:
     """An empty figure of the common width with automatic layout."""
-    figure = new_picture(_WIDTH_IN, height_in)
+    figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=13)
     return figure
 
@@ -69,40 +65,3 @@ def write_facts(axes: Axes, facts: Sequence[tuple[str, str]]) -> float:
                 drawn.set_in_layout(False)
             line += 1
     return _LINE_IN * (line + 2)
-
-
-def plain(text: str) -> str:
-    """The text as matplotlib shows it: of bounded length, control characters escaped, without formulas."""
-    shown = printable(text)
-    shown = shown if len(shown) <= _MOST_CHARACTERS else shown[: _MOST_CHARACTERS - 3] + "..."
-    return shown.replace("$", r"\$")
-
-
-def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure with constrained layout."""
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
-    FigureCanvasSVG(figure)
-    return figure
-
-
-def new_picture(width_in: float, height_in: float) -> Figure:
-    """An empty figure that becomes an image of pixels, with constrained layout."""
-    figure = Figure(figsize=(width_in, height_in), dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def webp_of(figure: Figure) -> str:
-    """The figure as the `data:` address of a WebP image."""
-    with io.BytesIO() as packed:
-        figure.savefig(packed, format="webp", pil_kwargs={"quality": 82})
-        return "data:image/webp;base64," + b64encode(packed.getvalue()).decode()
-
-
-def svg_of(figure: Figure, name: str) -> str:
-    """The `<svg>` element; `name` makes its ids unique on the page."""
-    text = io.StringIO()
-    with mpl.rc_context({"svg.hashsalt": name, "svg.fonttype": "path"}):
-        figure.savefig(text, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
-    whole = text.getvalue()
-    return whole[whole.index("<svg") :]

@@ -62,10 +62,6 @@ BEST = Style("#ffc400", "*", "best success")
 BEST_BY_SCORE = Style("#ffffff", "P", "highest score where the base fits")
 TARGET = Style("#ff2d6f", "", "target", "#ffffff")
 CLUTTER = Style("#c9d2db", "", "other objects", "#4a5560")
-MARK_STYLES = {"camera": CAMERA, "best": BEST, "best by score": BEST_BY_SCORE}
-
-# Cells of a grid: where the base does not fit, where it fits and the label is bad, where the label is good.
-CELL_COLOURS = ("#a8a8a8", "#f6c28b", _GOOD)
 # matplotlib's and plotly's scale of scores: red is low, blue is high.
 SCORE_COLOURS = "RdYlBu"
 PHASE_COLOURS = {
@@ -75,7 +71,3 @@ PHASE_COLOURS = {
     "lift": "#3a86c8",
     "hold": "#14375e",
 }
-# Methods of an evaluation: strong colours for models, quiet ones for baselines; all have their own markers.
-MODEL_COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#000000", "#e69f00")
-BASELINE_COLOURS = ("#7f7f7f", "#b5a72a", "#7a9fb8", "#8c564b", "#d98cc0", "#5b8c5a", "#4a4a4a", "#b08d57")
-MODEL_MARKERS, BASELINE_MARKERS = "os^DvP", "X<>phd8H"

@@ -9,32 +9,25 @@ reads, so that no houses, objects and runs are needed. `PACK` is the folder of t
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import Field, ValidationError, field_serializer
 
-from datagen.evaluation.columns import EXTRA
 from datagen.evaluation.methods import EvaluatedMethod
 from datagen.evaluation.runs import EvaluatedRun
 from datagen.schemas.errors import InputError, choices
-from datagen.schemas.fields import RecordSchema, sized_schema
 from datagen.schemas.identity import digest_of
 from datagen.schemas.record_files import different_fields
 from datagen.schemas.run_records import Digest, StoredRecord
-from datagen.schemas.safe_files import read_regular, whole_file
-from datagen.schemas.sealing import ZIPPED, encode_store
+from datagen.schemas.safe_files import read_regular
+from datagen.schemas.sealing import ZIPPED
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
-from datagen.train.baselines import FIELDS
-from datagen.train.batching import SAMPLE_FIELDS, SCENE_FIELDS
-from datagen.train.reader import JOIN_FIELDS, Columns, SampleReader, load_shard
-from datagen.train.run_parts import RunPart, open_parts
-from datagen.train.scene_table import TABLE_FIELDS
+from datagen.train.reader import JOIN_FIELDS, Columns, SampleReader
+from datagen.train.run_parts import open_parts
 
 DEFINITION = "benchmark.json"
 SHIPPED = Path(str(files("datagen.evaluation") / DEFINITION))
@@ -133,7 +126,7 @@ def read_benchmark(folder: Path | None = None) -> Benchmark:
 def shipped_pack() -> Path:
     """The folder of the package's own pack. InputError where it has none."""
     if not (PACK / DEFINITION).exists():
-        fix = "Name runs of `datagen benchmark make`, or a folder of `datagen benchmark pack`"
+        fix = "Name runs of `datagen benchmark make`, or a pack"
         raise InputError("--runs", "", "is not given, and this version comes without a pack", fix)
     return PACK
 
@@ -209,64 +202,3 @@ def refuse_trained_objects(run: EvaluatedRun, methods: Sequence[EvaluatedMethod]
             )
             fix = "Train on OUT/objects/train of `benchmark make`"
             raise InputError(run.place, "object_digest", problem, fix)
-
-
-# What methods may use and scoring does not read.
-_SHOWN = ("T_world_camera", "intrinsics_px", "image_size_px", "candidate_index")
-_PACKED = {*SCENE_FIELDS, *SAMPLE_FIELDS, *TABLE_FIELDS, *EXTRA, *FIELDS, *_SHOWN}
-
-
-def write_pack(
-    paths: dict[str, str], benchmark: Benchmark, out: Path, scenes: int, with_labels: bool
-) -> Iterator[tuple[Path, BenchmarkRun]]:
-    """Write the first scenes of the runs at `paths` to a new folder; yield each file and what it holds.
-
-    Runs have equal shares of `scenes`, the first ones one more where they do not divide evenly, or all scenes
-    of a shorter run. The definition is written last. InputError for a folder with files or too few scenes.
-    """
-    if out.is_dir() and any(out.iterdir()):
-        raise InputError(out, "--out", "is not empty", "Name a new folder")
-    if scenes < len(paths):
-        fix = f"Give {len(paths)} or more, a scene a run"
-        raise InputError("--scenes", str(scenes), f"is less than the {len(paths)} runs", fix)
-    packed: dict[str, BenchmarkRun] = {}
-    held = 0
-    for k, (name, path) in enumerate(paths.items()):
-        part, schema, columns = _first_scenes(path, (scenes + len(paths) - 1 - k) // len(paths))
-        n, digests = len(columns["sample_id"]), digests_over([columns])
-        held += len(columns["scene_index"])
-        packed[name] = benchmark.runs[name].model_copy(update={"n": n, "digests": digests})
-        if not with_labels:
-            kept = tuple(field for field in schema.sample_fields if field.name != "label")
-            schema = replace(schema, sample_fields=kept)
-        sources = part.sources[0]
-        file = out / f"{name}{ZIPPED}"
-        with whole_file(file) as stream:
-            stream.write(encode_store(schema, part.specs[0], sources, columns))
-        yield file, packed[name]
-    version = f"{benchmark.version[:20]} pack of {held} scenes"
-    with whole_file(out / DEFINITION) as stream:
-        stream.write(f"{Benchmark(version=version, runs=packed).model_dump_json(indent=1)}\n".encode())
-
-
-def _first_scenes(path: str, scenes: int) -> tuple[RunPart, RecordSchema, Columns]:
-    """The run, the fields that a pack has, and its first whole scenes, at most `scenes`, in stored order."""
-    (run,) = open_parts([path], JOIN_FIELDS)
-    schema = sized_schema(run.schema, run.specs[0], run.schema_version)
-    scene, sample = (
-        tuple(field for field in fields if field.name in _PACKED)
-        for fields in (schema.scene_fields, schema.sample_fields)
-    )
-    schema = replace(schema, scene_fields=scene, sample_fields=sample)
-    (part,) = open_parts([path], [field.name for _, field in schema.fields])
-    taken: list[Columns] = []
-    for place in part.shards:
-        columns, bounds = load_shard(place, part.arrays)
-        whole = int((np.diff(bounds) == place.full_samples // place.full_scenes).sum())
-        first = min(whole, scenes)
-        past = {"scene": first, "sample": bounds[first]}
-        taken.append({name: a[: past[part.arrays[name].dims[0]]] for name, a in columns.items()})
-        scenes -= first
-        if not scenes:
-            break
-    return part, schema, {name: np.concatenate([each[name] for each in taken]) for name in taken[0]}

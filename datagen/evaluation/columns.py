@@ -15,10 +15,7 @@ from datagen.train.scorers import Scorer, scored
 from datagen.workers.bases.candidate_sets import in_set
 
 # Further columns of a batch that the evaluation needs.
-EXTRA = (
-    *("base_yaw_rad", "base_is_clear", "distance_m", "mount_distance_m"),
-    *("house_id", "object_name", "place", "scene_index"),
-)
+EXTRA = ("base_is_clear", "distance_m", "mount_distance_m", "house_id", "place", "scene_index")
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,13 +27,11 @@ class Columns:
     label: Bools  # (N,)
     is_clear: Bools  # (N,)
     base_xy_m: F32  # (N, 2), target frame
-    base_yaw_rad: F32  # (N,), world, whose axes the target frame has
     distance_m: F32  # (N,)
     mount_distance_m: F32  # (N,)
     reach_m: F32  # (N,)
     scores: Mapping[str, F64]  # (N,) each
     house: Array  # (S,) text
-    target: Array  # (S,) text
     place: Array  # (S,) index in PLACE_KINDS
     run: I64  # (S,) index of the run
     is_grid: Bools  # (S,) whether it has all cells of a grid, for one robot
@@ -76,7 +71,7 @@ class Columns:
         return in_set(candidates, self.is_clear, self.is_reachable)
 
 
-_SCENE_COLUMNS = ("house", "target", "place", "run", "is_grid")
+_SCENE_COLUMNS = ("house", "place", "run", "is_grid")
 _OF_ALL = ("scores", "reached_runs")
 
 
@@ -120,7 +115,7 @@ def _rows(batch: Batch[Array], first_scene: int, first_robot: int) -> dict[str, 
         "is_clear": batch.extra["base_is_clear"].astype(np.bool_),
         "base_xy_m": batch.candidates.base_xy_m,
         "reach_m": batch.robots.arm_reach_m[robot],
-        **{name: batch.extra[name] for name in ("base_yaw_rad", "distance_m", "mount_distance_m")},
+        **{name: batch.extra[name] for name in ("distance_m", "mount_distance_m")},
     }
 
 
@@ -130,7 +125,6 @@ def _scenes(batch: Batch[Array], run: int, cells: int) -> dict[str, Array]:
     candidates = np.bincount(batch.robots.cloud_row[batch.candidates.robot_row], minlength=n)
     return {
         "house": batch.extra["house_id"],
-        "target": batch.extra["object_name"][:, 0],
         "place": batch.extra["place"],
         "run": np.full(n, run, np.int64),
         "is_grid": (robots == 1) & (candidates == cells) & (cells > 0),

@@ -15,7 +15,6 @@ from scipy.spatial import KDTree
 
 from datagen.evaluation.columns import Columns
 from datagen.evaluation.comparisons import Method
-from datagen.schemas.fields import facing_rad
 from datagen.schemas.specification import DECISIVE_SHARES
 from datagen.train.arrivals import Arrival, expected_success, ring_arrival, stands
 from datagen.train.bootstrap import Estimate, Weights, summed
@@ -97,7 +96,6 @@ class GridMaps:
     truth: F64  # (S, Y, X)
     is_clear: Bools  # (S, Y, X)
     step_m: float
-    yaw_rad: F64  # (S,), heading of the bases relative to the direction to the target
 
 
 def grid_maps(columns: Columns) -> GridMaps | None:
@@ -113,10 +111,8 @@ def grid_maps(columns: Columns) -> GridMaps | None:
     step_m = float(wide_m.mean() / (side - 1))
     order = np.lexsort([np.round(x / step_m * 2), np.round(y / step_m * 2), columns.scene])
     order = order.reshape(columns.n_scenes, side, side)
-    corner = order[:, 0, 0]
-    yaw_rad = columns.base_yaw_rad[corner] - facing_rad(-columns.base_xy_m[corner])
     truth, is_clear = columns.label[order].astype(np.float64), columns.is_clear[order]
-    return GridMaps(order, truth, is_clear, step_m, np.round(yaw_rad, 5))  # stored as float32
+    return GridMaps(order, truth, is_clear, step_m)
 
 
 def arrival_table(
@@ -177,8 +173,7 @@ def method_values(score: F64, maps: GridMaps, method: Method) -> F64:
 
 def smoothed(value: F64, maps: GridMaps, arrival: Arrival) -> F64:
     """Maps (S, Y, X) of the mean value over the arrivals of a robot that is sent to each cell."""
-    goals = zip(value, maps.yaw_rad.tolist(), strict=True)
-    return np.stack([expected_success(each, maps.step_m, arrival.turned(yaw)) for each, yaw in goals])
+    return np.stack([expected_success(each, maps.step_m, arrival) for each in value])
 
 
 def _picked(value: F64, truth: F64, is_clear: Bools) -> F64:

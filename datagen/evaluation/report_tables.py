@@ -36,18 +36,17 @@ _FAILURES_AT_M = 0.1
 
 @dataclass(frozen=True)
 class Table:
-    """A table with its title; a `detail` is folded on the page and left out of the terminal."""
+    """A table with its title."""
 
     title: str
     heads: Sequence[str]
     rows: Sequence[Sequence[str]]
-    detail: bool = False
 
 
 def set_tables(report: Report, scores: Report) -> Iterator[Table]:
     """The tables of one candidate set: methods, differences, reach and choices."""
     yield _accuracy(report, scores)
-    yield from comparison_tables(scores["comparisons"], scores["candidates"])
+    yield _comparisons(scores["comparisons"], scores["candidates"])
     if scores["out_of_reach"]["count"]:
         yield _reach(report, scores)
     yield _choice(report, scores)
@@ -75,23 +74,20 @@ def _accuracy(report: Report, scores: Report) -> Table:
     return Table(f"Table I, in %: {SET_WORDS[scores['candidates']]}; {words}", heads, rows)
 
 
-def comparison_tables(comparisons: Sequence[Report], where: str) -> Iterator[Table]:
-    """Paired differences of regimes and of the best model and baseline; in detail, all others."""
-    for title, detail in (
-        ("paired differences: regimes, and best model - best baseline", False),
-        ("further paired differences", True),
-    ):
-        rows = [
-            (
-                f"{d['first']} - {d['second']}",
-                METRIC_WORDS[d["metric"]],
-                with_interval(d, signed=True),
-                d["verdict"] if d["verdict"] != "open" else "not significant",
-            )
-            for d in comparisons
-            if (d["kind"] == "other") is detail
-        ]
-        yield Table(f"{title} ({where})", ("difference", "by", "points", "verdict"), rows, detail)
+def _comparisons(comparisons: Sequence[Report], where: str) -> Table:
+    """Paired differences of regimes, and of the best model and baseline."""
+    rows = [
+        (
+            f"{d['first']} - {d['second']}",
+            METRIC_WORDS[d["metric"]],
+            with_interval(d, signed=True),
+            d["verdict"] if d["verdict"] != "open" else "not significant",
+        )
+        for d in comparisons
+        if d["kind"] != "other"
+    ]
+    title = f"paired differences: regimes, and best model - best baseline ({where})"
+    return Table(title, ("difference", "by", "points", "verdict"), rows)
 
 
 def _reach(report: Report, scores: Report) -> Table:
@@ -147,7 +143,7 @@ def grid_tables(report: Report, grids: Report) -> Iterator[Table]:
     )
     heads = ("choice positive (%)", "else missed by (m)", "mAP (%)", "feasible AUC", "600 in (s)")
     yield Table(title, ("method", *heads), rows)
-    yield from comparison_tables(grids["comparisons"], "whole grids")
+    yield _comparisons(grids["comparisons"], "whole grids")
     if grids["arrivals"]:
         yield _arrivals(report, grids["arrivals"])
 

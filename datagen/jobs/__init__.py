@@ -1,1 +1,1 @@
-"""Jobs of `submit` and `resume`: on this machine, on a cluster or detached."""
+"""Jobs of `submit` and `resume`: on this machine or on a cluster."""

@@ -49,10 +49,7 @@ from datagen.workers.extras import refuse_missing
 
 _TASK_MEMORY_BYTES = 2**30  # that an attempt requests of a running cluster, twice with an arm
 _RECORDED_WITHIN_S = 5.0  # the end of a job that an error has ended, perhaps of the store
-_DETACH = (
-    "Run as a Ray job that continues after this shell ends: on the cluster of --address, its dashboard "
-    "http://HOST:8265, else on a Ray head of this machine."
-)
+_DETACH = "Check everything, then make the labels in a process that continues after this shell ends."
 
 
 @Parameter(name="*")
@@ -73,13 +70,12 @@ class JobOptions:
     quiet: Annotated[bool, Parameter(parse=False)] = False  # the command line always reports progress
 
     def refuse_bad(self) -> None:
-        """Raise InputError for values out of range and, unless detached, for an unreachable cluster."""
+        """Raise InputError for values out of range and for an unreachable cluster."""
         if self.workers is not None and not 0 <= self.workers <= 4096:
             fix = "Omit it for one per core"
             raise InputError("--workers", str(self.workers), "is not between 0 and 4096", fix)
-        if self.workers != 0 or self.detach:
-            refuse_missing("cluster", "" if self.detach else "or work in this process: --workers 0")
-        if self.workers != 0 and (not self.detach or self.address == "local"):
+        if self.workers != 0:
+            refuse_missing("cluster", "or work in this process: --workers 0")
             refuse_unusable(self.address)
 
     def display(self) -> Progress:

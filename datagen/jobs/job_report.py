@@ -28,7 +28,7 @@ class JobResult:
     """The result of a job, and the state of its run. Quarantined shards are those that failed repeatedly."""
 
     path: str  # the run, as the user wrote it
-    # detached: Ray makes the labels. failed: too many shards are quarantined. dry-run: nothing was made.
+    # detached: another process goes on. failed: too many shards are quarantined. dry-run: nothing was made.
     end: Literal["complete", "failed", "interrupted", "detached", "dry-run"]
     n: int = 0  # labels wanted
     made_from: str = ""  # houses, objects, robot and places
@@ -45,9 +45,7 @@ class JobResult:
     doubt: str = ""  # asks about the robot where no label of the run is positive
     cause: str = ""  # the most frequent one of a failed job
     resume: tuple[str, ...] = ()  # words of the command that continues, was detached, or a dry run would run
-    follow: tuple[
-        tuple[str, str], ...
-    ] = ()  # of a detached job: its submission, and how to follow and stop it
+    follow: tuple[tuple[str, str], ...] = ()  # of a detached job: its process, and how to follow and stop it
 
     @property
     def complete(self) -> bool:
@@ -77,8 +75,6 @@ def health_line(job: StoredJob) -> str:
     """One line on a job: state, progress, host and process."""
     record, state, health = job.record, job.state, job.health()
     where = f"{record.host}, process {record.pid}"
-    if record.submission:
-        where += f", submitted as {record.submission}"
     if health == "ended" and state is not None:
         return f"ended {state.end}, exit code {state.exit_code} ({where})"
     heard = f"last sign {seconds(job.silence().total_seconds())} ago"

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from datagen.cluster.job_monitor import JOBS_API
-from datagen.cluster.ray_head import head_token
 from datagen.configuration.robot_fields import refuse_missing_packages
 from datagen.console.command_lines import (
     absolute_path,
@@ -46,16 +43,13 @@ def with_absolute_paths(options: Options) -> Options:
 def words_to_resume(path: str, options: JobOptions, moved: Sources = AS_FOUND) -> list[str]:
     """The words of the command that resumes a run in the same way; `moved`: new locations of its sources."""
     kept = JobOptions(workers=options.workers, address=options.address, no_seal=options.no_seal)
-    where = given_options(kept)
-    if jobs_api := os.environ.get(JOBS_API):  # a detached job is detached again
-        where = {"--detach": True, "--address": None if head_token(jobs_api) else jobs_api}
     sources = {
         "--houses": moved.houses,
         "--objects": moved.objects,
         "--robot": moved.robot,
         "--scenes-from": moved.scenes_from,
     }
-    return ["resume", absolute_path(path), *words_of(sources | where)]
+    return ["resume", absolute_path(path), *words_of(sources | given_options(kept))]
 
 
 def open_job_run(run: Run, given: Sources) -> JobRun:

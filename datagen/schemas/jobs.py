@@ -43,7 +43,7 @@ class JobRecord(StoredRecord):
     pid: int = Field(ge=0)
     started: str
     address: str  # local, or the address of the Ray cluster
-    submission: str = ""  # for a detached job: its name in the Ray Jobs API, and the address of the API
+    submission: str = ""  # of older versions: name and address in Ray's Jobs API
     jobs_api: str = ""
 
 

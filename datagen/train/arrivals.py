@@ -9,34 +9,30 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 from scipy.special import ndtri
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.safe_files import read_regular
 from datagen.train.inputs import F64, Bools
 
 _RINGS, _ANGLES = 8, 16
 _LARGEST_M = 2.0
-_MOST_BYTES, _LEAST_ROWS, _MOST_ROWS = 10_000_000, 10, 100_000
-_USED_ROWS = 1000  # evenly spaced rows of a file of samples
-_FIX = (
-    "Give normal:0.05 (m), normal:0.05,3deg, disc:0.25, nav2 or a CSV file with columns x_m, y_m[, yaw_rad]"
-)
+_FIX = "Give normal:0.05 (m), normal:0.05,3deg, disc:0.25 or nav2"
 _TOLERANCE_STEP_M, _TOLERANCE_MOST_M = 0.01, 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Arrival:
-    """Equally likely errors (K, 3) at the goal: x ahead and y to the left (m), and yaw (rad)."""
+    """Equally likely errors (K, 3) at the goal: x ahead and y to the left (m), and yaw (rad).
+
+    They are the same in all directions, so that the goal's heading does not matter.
+    """
 
     text: str
     offsets: F64  # (K, 3)
-    is_round: bool  # the same in all directions, so the goal's heading does not matter
 
     @property
     def yaw_std_rad(self) -> float:
@@ -47,12 +43,6 @@ class Arrival:
     def distance_m(self) -> float:
         """Root mean square distance of the arrivals from the goal."""
         return float(np.sqrt(np.mean((self.offsets[:, :2] ** 2).sum(axis=1))))
-
-    def turned(self, yaw_rad: float) -> Arrival:
-        """The same errors as seen from a goal that faces the target, for one with another heading to it."""
-        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        return replace(self, offsets=self.offsets @ turn) if yaw_rad and not self.is_round else self
 
     def drawn(self, n: int, rng: np.random.Generator) -> F64:
         """`n` of the errors (n, 3), evenly spaced from a random start, so that a few still differ.
@@ -67,32 +57,32 @@ def normal_arrival(std_m: float, yaw_std_rad: float = 0.0) -> Arrival:
     """Normal errors, with one standard deviation along x and y."""
     ring = std_m * np.sqrt(-2 * np.log1p(-_shares()))
     yaw = f", {math.degrees(yaw_std_rad):.3g} deg" if yaw_std_rad else ""
-    return Arrival(f"normal, {std_m:g} m{yaw}", _round(ring, yaw_std_rad * ndtri(_yaw_shares())), True)
+    return Arrival(f"normal, {std_m:g} m{yaw}", _round(ring, yaw_std_rad * ndtri(_yaw_shares())))
 
 
 def disc_arrival(radius_m: float, yaw_rad: float = 0.0) -> Arrival:
     """Uniform errors in a disc, and uniform yaw errors up to `yaw_rad`."""
     yaw = f", {math.degrees(yaw_rad):.3g} deg" if yaw_rad else ""
     text = f"uniform within {radius_m:g} m{yaw}"
-    return Arrival(text, _round(radius_m * np.sqrt(_shares()), yaw_rad * (2 * _yaw_shares() - 1)), True)
+    return Arrival(text, _round(radius_m * np.sqrt(_shares()), yaw_rad * (2 * _yaw_shares() - 1)))
 
 
 def ring_arrival(distance_m: float, yaw_std_rad: float = 0.0) -> Arrival:
     """Errors of exactly this distance in all directions, and normal yaw errors."""
     yaw_rad = yaw_std_rad * ndtri(_yaw_shares())
-    return Arrival(f"{distance_m:g} m off", _round(np.array([distance_m]), yaw_rad), True)
+    return Arrival(f"{distance_m:g} m off", _round(np.array([distance_m]), yaw_rad))
 
 
 def read_arrival(given: str) -> Arrival:
-    """The arrival error of normal:STD[,YAW], disc:RADIUS[,YAW], nav2, or a CSV file; yaw as 3deg or in rad.
+    """The arrival error of normal:STD[,YAW], disc:RADIUS[,YAW] or nav2; yaw as 3deg or in rad.
 
     InputError for anything else.
     """
     if given == "nav2":
         return disc_arrival(0.25, 0.25)
     kind, _, numbers = given.partition(":")
-    if kind not in ("normal", "disc") or not numbers:
-        return _read_samples(Path(given))
+    if kind not in ("normal", "disc"):
+        raise InputError("--arrival", given[:60], "is not a distribution", _FIX)
     found = re.fullmatch(r"\s*([0-9.eE+-]+)\s*(?:,\s*([0-9.eE+-]+)\s*(deg)?\s*)?", numbers, re.ASCII)
     try:
         size_m, yaw = (float(found[1]), float(found[2] or 0)) if found else (math.nan, math.nan)
@@ -103,33 +93,6 @@ def read_arrival(given: str) -> Arrival:
         problem = f"is not a length from 0 to {_LARGEST_M:g} m and an angle"
         raise InputError("--arrival", given[:60], problem, _FIX)
     return normal_arrival(size_m, yaw_rad) if kind == "normal" else disc_arrival(size_m, yaw_rad)
-
-
-def _read_samples(path: Path) -> Arrival:
-    if not path.is_file():
-        raise InputError("--arrival", str(path)[:60], "is neither a distribution nor a file", _FIX)
-    text = read_regular(path, _MOST_BYTES, _FIX).decode("utf-8", errors="replace")
-    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    names = [name.strip() for name in lines[0].split(",")] if lines else []
-    fix = "Give a header x_m,y_m,yaw_rad and one arrival a line: ahead of and left of the goal, and its turn"
-    if names not in (["x_m", "y_m"], ["x_m", "y_m", "yaw_rad"]):
-        raise InputError(path, "header", f"is {','.join(names)[:60]!r}", fix)
-    if not _LEAST_ROWS <= len(lines) - 1 <= _MOST_ROWS:
-        problem = f"are {len(lines) - 1}, not {_LEAST_ROWS} to {_MOST_ROWS:,}"
-        raise InputError(path, "arrivals", problem, "Record more arrivals, or cut the file")
-    try:
-        rows = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
-    except ValueError as error:
-        raise InputError(path, "arrivals", str(error)[:200], fix) from None
-    if rows.shape[1] != len(names):
-        raise InputError(path, "arrivals", f"have {rows.shape[1]} columns, not {len(names)}", fix)
-    rows = np.column_stack([rows, np.zeros(len(rows))])[:, :3]
-    bad = ~(np.hypot(rows[:, 0], rows[:, 1]) <= _LARGEST_M) | ~(np.abs(rows[:, 2]) <= np.pi)
-    if bad.any():
-        problem = f"is not within {_LARGEST_M:g} m and half a turn"
-        raise InputError(path, f"arrival {int(bad.argmax()) + 1}", problem, fix)
-    samples = rows[np.linspace(0, len(rows) - 1, min(len(rows), _USED_ROWS)).astype(np.int64)]
-    return Arrival(f"{len(rows):,} arrivals of {path.name}", samples, False)
 
 
 def _shares() -> F64:
@@ -152,27 +115,16 @@ def _round(rings_m: F64, yaws_rad: F64) -> F64:
 def expected_success(value: F64, step_m: float, arrival: Arrival) -> F64:
     """Mean (Y, X) of a map (Y, X) over the arrivals of a robot that is sent to each of its cells.
 
-    Rows go along y and columns along x, `step_m` apart. Goals face the target in the middle. Between cells
-    the map is bilinear, outside it 0.
+    Rows go along y and columns along x, `step_m` apart. Between cells the map is bilinear, outside it 0.
     """
     dx, dy = arrival.offsets[:, 0] / step_m, arrival.offsets[:, 1] / step_m
-    if arrival.is_round:
-        n = int(np.ceil(max(np.abs(dx).max(), np.abs(dy).max()))) + 1
-        kernel = np.zeros((2 * n + 1, 2 * n + 1))
-        x, y = np.floor(dx).astype(int), np.floor(dy).astype(int)
-        for across, up in ((0, 0), (1, 0), (0, 1), (1, 1)):
-            weight = np.abs(1 - across - (dx - x)) * np.abs(1 - up - (dy - y))
-            np.add.at(kernel, (y + up + n, x + across + n), weight / len(dx))
-        return np.asarray(ndimage.correlate(value, kernel, mode="constant"), np.float64)
-    cells: F64 = np.indices(value.shape).astype(np.float64)
-    rows, columns = cells[0], cells[1]
-    middle = (np.array(value.shape) - 1) / 2
-    yaw: F64 = np.arctan2(middle[0] - rows, middle[1] - columns)[..., None]
-    x = columns[..., None] + np.cos(yaw) * dx - np.sin(yaw) * dy
-    y = rows[..., None] + np.sin(yaw) * dx + np.cos(yaw) * dy
-    return np.asarray(ndimage.map_coordinates(value, [y, x], order=1, mode="constant"), np.float64).mean(
-        axis=2
-    )
+    n = int(np.ceil(max(np.abs(dx).max(), np.abs(dy).max()))) + 1
+    kernel = np.zeros((2 * n + 1, 2 * n + 1))
+    x, y = np.floor(dx).astype(int), np.floor(dy).astype(int)
+    for across, up in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        weight = np.abs(1 - across - (dx - x)) * np.abs(1 - up - (dy - y))
+        np.add.at(kernel, (y + up + n, x + across + n), weight / len(dx))
+    return np.asarray(ndimage.correlate(value, kernel, mode="constant"), np.float64)
 
 
 def tolerance_m(value: F64, step_m: float, cell: tuple[int, int], least: float) -> float:

@@ -24,9 +24,10 @@ import ray
 import yaml
 
 from datagen.cli import build_app
-from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, free_port, new_token
+from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, new_token
 from datagen.jobs.job import _TASK_MEMORY_BYTES
 from tests.faults.test_ray_processes import kill_machine
+from tests.s3_servers import free_port
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEPLOY = REPOSITORY / "datagen" / "cluster" / "deploy"

@@ -10,14 +10,11 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex, to_rgb
 
 from datagen.display.styles import (
-    BASELINE_COLOURS,
-    BASELINE_MARKERS,
-    CELL_COLOURS,
+    BEST,
+    BEST_BY_SCORE,
+    CAMERA,
     CLUTTER,
     LABEL_STYLES,
-    MARK_STYLES,
-    MODEL_COLOURS,
-    MODEL_MARKERS,
     OUTCOME_STYLES,
     PHASE_COLOURS,
     SCORE_COLOURS,
@@ -44,10 +41,8 @@ _WHITE = np.array([0.9505, 1.0, 1.089])
 # are CIE76 (Euclidean in CIELAB): 2.3 is just noticeable, 10 is seen at a glance.
 TOGETHER = {
     "labels": ([style.colour for style in LABEL_STYLES.values()], 60),
-    "cells": (list(CELL_COLOURS), 25),
     "phases": (list(PHASE_COLOURS.values()), 25),
     "objects": ([TARGET.colour, CLUTTER.colour], 25),
-    "models": (list(MODEL_COLOURS), 15),
     "scores": ([to_hex(colormaps[SCORE_COLOURS](x)) for x in (0.0, 0.5, 1.0)], 45),
 }
 
@@ -89,12 +84,9 @@ def test_colours_of_one_figure_differ(name: str, eye: str) -> None:
     assert min(distance(a, b, eye) for a, b in combinations(colours, 2)) > least
 
 
-def test_picks_labels_and_methods_have_markers_of_their_own() -> None:
-    marks = [style.marker for style in MARK_STYLES.values()]  # camera and picks
+def test_picks_and_labels_have_markers_of_their_own() -> None:
+    marks = [style.marker for style in (CAMERA, BEST, BEST_BY_SCORE)]  # camera and picks
     drawn = {style.marker for style in (*OUTCOME_STYLES.values(), *LABEL_STYLES.values())}
     assert len(set(marks)) == len(marks) and not drawn & set(marks)
     assert LABEL_STYLES[0].marker != LABEL_STYLES[1].marker
-    assert LABEL_STYLES[1].colour == OUTCOME_STYLES["success"].colour == CELL_COLOURS[2]
-    methods = MODEL_MARKERS + BASELINE_MARKERS
-    assert len(set(methods)) == len(methods)
-    assert (len(MODEL_COLOURS), len(BASELINE_COLOURS)) == (len(MODEL_MARKERS), len(BASELINE_MARKERS))
+    assert LABEL_STYLES[1].colour == OUTCOME_STYLES["success"].colour

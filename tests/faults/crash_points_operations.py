@@ -10,7 +10,7 @@ from pathlib import Path
 from uuid import uuid4
 
 from datagen.cluster.run_recorder import close_lost_attempts
-from datagen.relabelling import relabel_run, relabelled_specification
+from datagen.jobs.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.repair import clean_runs, repair_runs
 from datagen.schemas.errors import InputError
@@ -268,8 +268,8 @@ def _relabel(folder: Path) -> None:
     source = Run.open(folder / "a")
     spec = relabelled_specification(source, {"heuristic.tau": 0.5})
     done = relabel_run(open_storage(folder / "out"), source, spec, json=True)
-    if done.summary.end != "complete":
-        raise InputError(folder / "out", "", done.summary.cause, "Again")  # as the command does
+    if done.end != "complete":
+        raise InputError(folder / "out", "", done.cause, "Again")
 
 
 OPERATIONS = (

@@ -17,9 +17,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, free_port, new_token
+from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, new_token
 from tests.faults.counted import check_rows
 from tests.made_runs import make_run
+from tests.s3_servers import free_port
 
 pytestmark = pytest.mark.slow
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from datagen import cli
 from datagen.configuration.stored_scenes import open_stored_scenes, specify_again
-from datagen.relabelling import relabel_run, relabelled_specification
+from datagen.jobs.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.run import Run
 from datagen.schemas.specification import HeuristicParams
 from datagen.schemas.storage import open_storage
@@ -51,8 +51,8 @@ def relabelled(source: Path, out: Path, rule: dict[str, Any]) -> Run:
     run = Run.open(source)
     spec = relabelled_specification(run, {f"heuristic.{name}": value for name, value in rule.items()})
     done = relabel_run(open_storage(out), run, spec)
-    assert done.summary.end == "complete"
-    return done.run
+    assert done.end == "complete"
+    return Run.open(out)
 
 
 def score(d: float, rho: float, params: HeuristicParams) -> float:

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from datagen.cluster.run_recorder import close_lost_attempts
-from datagen.relabelling import relabel_run, relabelled_specification
+from datagen.jobs.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.repair import clean_runs, repair_runs
 from datagen.schemas.errors import InputError

@@ -1,16 +1,14 @@
-"""Arrival errors: their moments, maps smoothed by them, and files that are refused."""
+"""Arrival errors: their moments, maps smoothed by them, and texts that are refused."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from datagen.schemas.errors import InputError
 from datagen.train.arrivals import (
-    Arrival,
     disc_arrival,
     expected_success,
     normal_arrival,
@@ -34,23 +32,13 @@ def test_moments_of_the_distributions() -> None:
 
 def test_smoothing_a_plane_keeps_it_and_an_edge_halves() -> None:
     y, x = np.indices((11, 11)).astype(float)
-    for arrival in (normal_arrival(0.05), Arrival("file", normal_arrival(0.05).offsets, False)):
-        np.testing.assert_allclose(expected_success(0.1 * x + y, STEP_M, arrival)[5, 5], 5.5, atol=1e-9)
+    smooth = expected_success(0.1 * x + y, STEP_M, normal_arrival(0.05))
+    np.testing.assert_allclose(smooth[5, 5], 5.5, atol=1e-9)
     edge = (x >= 5).astype(float)
     half = expected_success(edge, STEP_M, ring_arrival(0.3))
     assert half[5, 5] == pytest.approx(0.55, abs=0.06) and half[5, 7] > 0.8 and half[5, 1] == 0
     np.testing.assert_allclose(expected_success(0.1 * x + y, STEP_M, ring_arrival(0.0)), 0.1 * x + y)
     assert expected_success(np.ones((7, 7)), STEP_M, ring_arrival(0.2))[0, 0] < 0.5  # off the map
-
-
-def test_errors_of_a_file_turn_with_the_goal() -> None:
-    """All arrive 0.2 m short of the goal, so away from the target in the middle of the map."""
-    short = Arrival("short", np.array([[-0.2, 0.0, 0.0]]), False)
-    y, x = np.indices((11, 11)).astype(float)
-    gap = np.hypot(x - 5, y - 5)
-    found = expected_success(gap, STEP_M, short)
-    inside = (gap > 0.5) & (gap < 2.5)
-    np.testing.assert_allclose(found[inside], gap[inside] + 2, atol=0.1)
 
 
 def test_how_far_a_pose_may_be_missed() -> None:
@@ -69,28 +57,8 @@ def test_what_is_no_distribution_is_refused(text: str) -> None:
         read_arrival(text)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("a,b\n1,2\n", "header"),
-        ("x_m,y_m\n0,0\n", "arrivals: are 1"),
-        ("x_m,y_m\n" + "0,0\n" * 10 + "0,far\n", "could not convert string 'far'"),
-        ("x_m,y_m,yaw_rad\n" + "0,0,0\n" * 10 + "0,0,9\n", "arrival 11"),
-        ("x_m,y_m\n" + "0,0\n" * 10 + "0,nan\n", "arrival 11"),
-        ("", "header"),
-    ],
-)
-def test_bad_files_are_refused(text: str, words: str, tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text(text)
-    with pytest.raises(InputError, match=words):
-        read_arrival(str(tmp_path / "a.csv"))
-
-
-def test_texts_and_files_of_arrivals(tmp_path: Path) -> None:
+def test_texts_of_arrivals() -> None:
     turning = read_arrival("normal:0.05,3deg").offsets
     np.testing.assert_array_equal(turning, normal_arrival(0.05, math.radians(3)).offsets)
     np.testing.assert_array_equal(read_arrival("nav2").offsets, disc_arrival(0.25, 0.25).offsets)
     assert read_arrival("normal:0.05").text == "normal, 0.05 m"
-    (tmp_path / "a.csv").write_text("x_m,y_m,yaw_rad\n" + "0.1,0,0.2\n-0.1,0,-0.2\n" * 10)
-    arrival = read_arrival(str(tmp_path / "a.csv"))
-    assert len(arrival.offsets) == 20 and arrival.yaw_std_rad == pytest.approx(0.2) and not arrival.is_round

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,8 @@ import plotly.graph_objects as go
 from plotly.colors import get_colorscale
 from plotly.io import to_html
 
-from datagen.display.html_page import html_facts, html_figure, html_page
 from datagen.display.styles import BEST, SCORE_COLOURS, TARGET
+from datagen.schemas.errors import printable
 from datagen.train.inputs import F64
 from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import STATES
@@ -25,6 +26,22 @@ _CAPTION = (
     "to turn, scroll or pinch to zoom, point at a square to read its score. Gold is the robot at the best "
     "pose: its base, its heading, and the camera's mast."
 )
+_STYLE = """
+:root { color-scheme: light dark; --paper: #ffffff; --ink: #1b1f24; --pale: #59636e; --accent: #0b57a4; }
+@media (prefers-color-scheme: dark) {
+  :root { --paper: #14181d; --ink: #e6eaef; --pale: #a3afbb; --accent: #7db8f5; } }
+* { box-sizing: border-box; }
+body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); margin: 0 auto;
+  max-width: 78rem; padding: 0 1rem 3rem; border-top: 6px solid var(--accent); }
+h1 { font-size: 1.6rem; line-height: 1.25; overflow-wrap: anywhere; }
+figure { margin: .6rem 0 1.2rem; padding: .4rem; background: #ffffff; color: #1b1f24;
+  border: 1px solid var(--pale); border-radius: 6px; overflow-x: auto; }
+figcaption { font-size: .92rem; color: #59636e; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1rem; margin: .6rem 0; }
+dt { color: var(--pale); }
+dd { margin: 0; min-width: 0; grid-column: 2; overflow-wrap: anywhere; }
+@media (max-width: 40rem) { dl { display: block; } dd { margin-bottom: .4rem; } h1 { font-size: 1.35rem; } }
+"""
 _COLOURBAR = {"title": {"text": "score"}, "orientation": "h", "y": 1, "yanchor": "bottom", "thickness": 12}
 
 
@@ -51,8 +68,21 @@ def page_of(prediction: Prediction) -> str:
         full_html=False, div_id="prediction", default_height="min(40rem, 120vw)",
         config={"responsive": True, "displaylogo": False},
     )  # fmt: skip
-    body = [html_facts(report_rows(prediction)), html_figure(view, _CAPTION)]
-    return html_page(f"Base poses scored by {prediction.scorer}", body)
+    title = escaped(f"Base poses scored by {prediction.scorer}")
+    rows = ((head, escaped(text)) for head, text in report_rows(prediction))
+    # A text without a heading belongs to the one above.
+    facts = "".join((f"<dt>{escaped(head)}</dt>" if head else "") + f"<dd>{text}</dd>" for head, text in rows)
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{title}</title><style>{_STYLE}</style></head>\n<body>\n<h1>{title}</h1>\n<dl>{facts}</dl>\n"
+        f'<figure tabindex="0">{view}<figcaption>{escaped(_CAPTION)}</figcaption></figure>\n</body></html>\n'
+    )
+
+
+def escaped(text: str) -> str:
+    """The text escaped for HTML, without markup or control characters."""
+    return escape(printable(text))
 
 
 def _cloud(prediction: Prediction) -> dict[str, Any]:

@@ -21,7 +21,6 @@ class Site:
     cut_after: list[int] = field(default_factory=list)
     # Consumed one a request, before anything else: answer with this status.
     statuses: list[int] = field(default_factory=list)
-    hide_length: bool = False
     redirect_to: str = ""
     requests: list[tuple[str, str | None, str | None]] = field(default_factory=list)
     url: str = ""
@@ -62,8 +61,7 @@ def serve() -> Generator[Site]:
             if site.etag:
                 self.send_header("ETag", tag)
             rest = body[start:]
-            if not site.hide_length:
-                self.send_header("Content-Length", str(len(rest)))
+            self.send_header("Content-Length", str(len(rest)))
             self.end_headers()
             self.wfile.write(rest[: site.cut_after.pop(0)] if site.cut_after else rest)
             self.close_connection = True

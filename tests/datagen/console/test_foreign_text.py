@@ -8,9 +8,9 @@ import pytest
 
 from datagen import cli
 from datagen.console.printing import print_lines, print_rows
-from datagen.display.html_page import escape
 from datagen.schemas.jobs import JobRecord, Jobs, JobState
 from datagen.schemas.run_records import LedgerEntry
+from datagen.train.prediction.page import escaped
 from tests.made_runs import give_up, make_run
 
 # A colour, the clipboard (OSC 52), a bell, a carriage return, C1 controls, text that runs backwards, markup.
@@ -51,7 +51,6 @@ VERBS = [
     ["status", "{run}", "--stacks"],
     ["status", "{run}", "--json"],
     ["audit", "{run}"],
-    ["report", "{run}", "--out", "{out}.html"],
     ["verify", "{run}"],
     ["verify", "{run}", "--repair", "--clean"],
     ["show", "{run}", "--scene", "0", "--out", "{out}.png"],
@@ -82,7 +81,7 @@ def test_tables_take_brackets_for_brackets(capsys: pytest.CaptureFixture[str]) -
 
 
 def test_a_page_shows_what_it_is_given() -> None:
-    assert escape(EVIL).isprintable() and "<" not in escape(EVIL) and "\\u202e" in escape(EVIL)
+    assert escaped(EVIL).isprintable() and "<" not in escaped(EVIL) and "\\u202e" in escaped(EVIL)
 
 
 def test_lines_keep_their_breaks(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from datagen.evaluation.columns import Columns
-from datagen.schemas.fields import facing_rad
 
 
 def make_columns(
@@ -32,13 +31,11 @@ def make_columns(
         label=label,
         is_clear=is_clear,
         base_xy_m=base_xy_m,
-        base_yaw_rad=facing_rad(-base_xy_m).astype(np.float32),
         distance_m=(mount_m * 0.9).astype(np.float32),
         mount_distance_m=mount_m,
         reach_m=reach_m,
         scores=dict(scores) if scores is not None else {"random": rng.random(n)},
         house=np.array([f"house-{k % 5}" for k in range(n_scenes)], object),
-        target=np.array([f"object-{k % 3}" for k in range(n_scenes)], object),
         place=np.arange(n_scenes, dtype=np.uint8) % 2,
         run=np.zeros(n_scenes, np.int64),
         is_grid=np.ones(n_scenes, np.bool_),
@@ -56,7 +53,6 @@ def make_grids(label: np.ndarray, score: np.ndarray) -> Columns:
     return replace(
         made,
         base_xy_m=base_xy_m,
-        base_yaw_rad=facing_rad(-base_xy_m).astype(np.float32),
         label=label.ravel()[order].astype(bool),
         is_clear=np.ones(len(made), bool),
         scores={"model": score.ravel()[order]},

@@ -42,12 +42,8 @@ def make_batch(first: int, robots: list[int], per_robot: int = CELLS) -> Batch[A
     extra: dict[str, Any] = {
         "base_is_clear": np.ones(n, np.uint8),
         "outcome": np.zeros(n, np.uint8),
-        **{
-            k: rng.random(n).astype(np.float32)
-            for k in ("base_yaw_rad", "distance_m", "mount_distance_m", "visibility")
-        },
+        **{k: rng.random(n).astype(np.float32) for k in ("distance_m", "mount_distance_m", "visibility")},
         "house_id": np.array([f"house-{first + k}" for k in range(s)], object),
-        "object_name": names,
         "place": np.zeros(s, np.uint8),
         "object_digest": names,
     }
@@ -79,7 +75,6 @@ def test_scenes_and_robots_are_numbered_through_all_places() -> None:
     assert columns.scene.tolist() == np.repeat([0, 1, 1, 2, 3, 4], CELLS).tolist()
     assert columns.robot.tolist() == np.repeat(np.arange(6), CELLS).tolist()
     assert columns.house.tolist() == [f"house-{k}" for k in range(5)]
-    assert columns.target.tolist() == [f"object-{k}" for k in range(5)]
     assert columns.run.tolist() == [0, 0, 0, 1, 1]
     # Two robots share a grid's cells, and the second place has no grids.
     assert columns.is_grid.tolist() == [True, False, True, False, False]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -15,9 +13,9 @@ from datagen.evaluation.closed_loop import (
 )
 from datagen.evaluation.columns import Columns
 from datagen.evaluation.comparisons import Method, TrainedBy
-from datagen.evaluation.grids import AT_RANDOM, BY_LABELS, GridMaps, decisive_grids, grid_maps, smoothed
+from datagen.evaluation.grids import AT_RANDOM, BY_LABELS, GridMaps, decisive_grids, grid_maps
 from datagen.evaluation.scores import weights_for
-from datagen.train.arrivals import Arrival, ring_arrival
+from datagen.train.arrivals import ring_arrival
 from datagen.train.inputs import F64
 from tests.datagen.evaluation.made_columns import make_grids
 
@@ -74,20 +72,6 @@ def test_arrivals_of_all_errors_lie_in_like_directions_and_spread() -> None:
     angle = np.sort(np.arctan2(offsets[1, ..., 1], offsets[1, ..., 0]), axis=1)
     np.testing.assert_allclose(np.diff(angle, axis=1), np.pi / 2, atol=0.01)
     assert len(set(angle[:, 0].tolist())) > 1  # scenes begin elsewhere
-
-
-def test_a_drift_ahead_follows_the_heading_of_the_base() -> None:
-    label = (np.random.default_rng(3).random((SIDE, SIDE)) < 0.5).astype(float)
-    columns = make_grids(label, label)
-    # On the axis through the target a goal at x = -0.5 looks along +x: ahead is the next column. With its
-    # right side to the target a base looks along +y there: ahead is the next row.
-    right = replace(columns, base_yaw_rad=(columns.base_yaw_rad + np.pi / 2).astype(np.float32))
-    np.testing.assert_allclose(np.cos(maps_of(right).yaw_rad - np.pi / 2), 1.0)
-    assert not maps_of(columns).yaw_rad.any()
-    drift = Arrival("ahead", np.array([[STEP_M, 0.0, 0.0]]), False)
-    for grids, cell in ((columns, (6, 4)), (right, (7, 3))):
-        maps = maps_of(grids)
-        np.testing.assert_allclose(smoothed(maps.truth, maps, drift)[:, 6, 3], label[cell], atol=1e-5)
 
 
 def test_rates_are_means_over_scenes_with_their_causes_and_gains() -> None:

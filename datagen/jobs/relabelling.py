@@ -20,6 +20,7 @@ from datagen.cluster.shard_policy import RetryPolicy
 from datagen.configuration.specify import manifest_of
 from datagen.configuration.stored_scenes import StoredScenes, specify_again
 from datagen.display.progress import Progress
+from datagen.jobs.job_report import JobResult
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import sample_ids
 from datagen.schemas.run import Run
@@ -36,26 +37,7 @@ from datagen.workers.labels import load_label_source
 Columns = dict[str, np.ndarray[Any, Any]]
 _READ = (
     "distance_m", "mount_distance_m", "arm_reach_m", "visibility", "sample_scene_index", "candidate_index",
-    "label", "label_version",
 )  # fmt: skip
-
-
-@dataclass
-class Flips:
-    """Counts of changed labels over shards."""
-
-    to_good: int = 0
-    to_bad: int = 0
-
-
-@dataclass
-class Relabelled:
-    """The result of a call."""
-
-    run: Run
-    summary: JobSummary
-    flips: Flips
-    absent: int  # planned shards that the source lacks
 
 
 def relabelled_specification(
@@ -87,21 +69,34 @@ def relabelled_specification(
     return spec.model_copy(update={"engines": dict(before.engines)})
 
 
-def relabel_run(storage: Storage, source: Run, spec: Specification, json: bool = False) -> Relabelled:
+def relabel_run(storage: Storage, source: Run, spec: Specification, json: bool = False) -> JobResult:
     """Relabel every committed shard of the run that is missing in `storage`, and seal.
 
-    InputError when `storage` holds something else.
+    Shards that the source lacks remain. InputError when `storage` holds something else, or is full.
     """
     if not source.committed():
         raise InputError(source.storage.url, "commits", "no shard is committed", "Resume the run first")
-    run, flips, stop = _open_target(storage, source, spec), Flips(), StopRequest()
+    run, stop = _open_target(storage, source, spec), StopRequest()
     planned = run.missing()
     missing = planned.within(ShardRanges.of(source.committed()))
     with stop_on_signals(stop, interrupt=True), Progress(json) as shown:
-        summary = _relabel_shards(run, source, missing, stop, flips, shown)
-    if summary.end in ("complete", "failed") and run.committed():
-        seal(storage)
-    return Relabelled(run, summary, flips, len(planned) - len(missing))
+        summary = _relabel_shards(run, source, missing, stop, shown)
+    if summary.end == "aborted":
+        raise InputError(storage.url, "", f"cannot continue: {summary.cause}", "Then run the command again")
+    return JobResult(
+        path=storage.url,
+        end=summary.end,
+        n=run.n,
+        made_from=f"{source.storage.url}, {source.manifest.made_from}",
+        labels=summary.totals.labels,
+        positives=summary.totals.positives,
+        shards=len(planned),
+        remaining=summary.remaining + len(planned) - len(missing),
+        quarantined=tuple(record.shard for record in run.quarantine_records()),
+        elapsed_s=summary.elapsed_s,
+        store="" if summary.end == "interrupted" or not run.committed() else seal(storage),
+        cause=summary.cause,
+    )
 
 
 def _open_target(storage: Storage, source: Run, spec: Specification) -> Run:
@@ -118,12 +113,12 @@ def _open_target(storage: Storage, source: Run, spec: Specification) -> Run:
 
 
 def _relabel_shards(
-    run: Run, source: Run, missing: Sequence[int], stop: StopRequest, flips: Flips, shown: Progress
+    run: Run, source: Run, missing: Sequence[int], stop: StopRequest, shown: Progress
 ) -> JobSummary:
     """Relabel the shards of one run in this process."""
 
     def work(task: RelabelTask, meter: Meter) -> AttemptResult:
-        return relabel_shard(run, source, task, meter, flips)
+        return relabel_shard(run, source, task, meter)
 
     def make_task(order: AttemptOrder) -> RelabelTask:
         return RelabelTask(order.shard, order.attempt, order.deadline_s)
@@ -150,7 +145,7 @@ class RelabelTask:
     notes: str = ""
 
 
-def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips: Flips) -> AttemptResult:
+def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter) -> AttemptResult:
     """Label a committed shard of `source` by the rule of `run`, and commit it there.
 
     Labels, scores and ids are new, all other arrays are the source's. Raises InputError for a damaged file,
@@ -168,10 +163,7 @@ def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips:
         made = _relabelled(run, stored)
         files = {path: kept.get(path) for path in kept.paths} | _made_files(run, made)
     # Nothing was sampled, so that there are no redraws.
-    result = commit_rows(run, task, zipped(files), made["label"], clock, meter, {}, before.cost.all_s)
-    flips.to_good += int((made["label"] > stored["label"]).sum())
-    flips.to_bad += int((made["label"] < stored["label"]).sum())
-    return result
+    return commit_rows(run, task, zipped(files), made["label"], clock, meter, {}, before.cost.all_s)
 
 
 def _relabelled(run: Run, stored: Columns) -> Columns:

@@ -1,1 +1,0 @@
-"""Runs, checkpoints and evaluations as one HTML page that opens offline."""
