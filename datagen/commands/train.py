@@ -86,7 +86,7 @@ class TrainOptions:
         out: Checkpoint to write; the same command resumes it.
         val: Runs for validation. [default: a tenth of the houses is held out]
         init: Checkpoint to continue from, of stage 1 or another training, or released (stage2).
-        model: shared, paper or module:attribute. [default: shared, or that of --init]
+        model: shared, paper, n2m or module:attribute. [default: shared, or that of --init]
         model_config: Sizes of the model: a TOML file, or field=value; repeat for more.
         epochs: Epochs. [default: 12 in stage1, else 20]
         house_share: Share of the houses to train on, for learning curves.

@@ -6,11 +6,16 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from datagen.train.models.model import Model
+from datagen.train.models.n2m import N2mModel
 from datagen.train.models.paper import PaperModel
 from datagen.train.models.shared import SharedModel
 from datagen.workers.registry import entry
 
-MODELS: dict[str, Callable[[Mapping[str, Any]], Model]] = {"paper": PaperModel, "shared": SharedModel}
+MODELS: dict[str, Callable[[Mapping[str, Any]], Model]] = {
+    "paper": PaperModel,
+    "shared": SharedModel,
+    "n2m": N2mModel,
+}
 
 
 def build_model(name: str, config: Mapping[str, Any]) -> Model:

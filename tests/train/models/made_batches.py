@@ -29,6 +29,7 @@ SMALL: dict[str, dict[str, Any]] = {
         "embedding": 16,
         "head": (16,),
     },
+    "n2m": {"n_points": 96, "components": 32, "widths": (32, 32), "head": (64,), "dropout": 0.0},
 }
 REACH_M = 0.8
 

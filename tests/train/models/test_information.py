@@ -14,7 +14,7 @@ from datagen.train.models import MODELS, Model
 from tests.train.models.made_batches import REACH_M, Tables, drawn_tables, small_model
 
 # `paper` cannot be told where the camera is: given the same, `shared` has to do without, too.
-ALIKE: dict[str, dict[str, str]] = {"paper": {}, "shared": {"camera": "unknown"}}
+ALIKE: dict[str, dict[str, str]] = {"paper": {}, "shared": {"camera": "unknown"}, "n2m": {}}
 
 
 def changed(tables: Tables, **fields: Tensor) -> Tables:

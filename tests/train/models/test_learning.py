@@ -28,7 +28,7 @@ def test_models_overfit_a_few_scenes(name: str, heuristic_run: Path):
     optimiser = torch.optim.Adam(model.parameters(), lr=3e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
     for step in range(STEPS):
-        # A loss in training says nothing of how candidates are scored: dropout and BatchNorm differ.
+        # A loss in training says nothing of how candidates are scored: n2m draws one of four frames for it.
         is_tried = step % 20 == 0 or step == STEPS - 1
         model.train(not is_tried)
         logits = model.score(batch.clouds, batch.candidates, batch.robots)

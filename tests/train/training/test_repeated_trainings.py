@@ -27,6 +27,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "encoded": {"model_config": WIDE},
     "stage2": {"model_config": WIDE, "stage": "stage2"},
     "paper": {"model": "paper", "model_config": {**TINY_PAPER, "widths": [[32], [32], [32]]}},
+    "n2m": {"model": "n2m", "model_config": {"n_points": 64, "components": 256, "widths": [8], "head": [8]}},
 }
 
 
