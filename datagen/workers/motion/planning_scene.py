@@ -237,7 +237,7 @@ def _core(model: ObjectModel, depth_m: float) -> Parts:
             cores = [core_of(part, depth_m) for part in model.convex_parts_m]
             ends = np.cumsum([len(core) for core in cores])
             _CORES.store(place, stored := {"points_m": np.concatenate(cores), "ends": ends})
-        known[depth_m] = in_memory(parts_of([np.split(stored["points_m"], stored["ends"][:-1])]))
+        known[depth_m] = in_memory(parts_of([np.split(stored["points_m"], stored["ends"][:-1].tolist())]))
     return known[depth_m]
 
 
