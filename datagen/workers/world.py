@@ -11,7 +11,7 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import Specification
-from datagen.workers.bases.clearance import Obstacles, obstacles_of
+from datagen.workers.bases.clearance import HouseObstacles
 from datagen.workers.content_cache import CacheFolder
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses import ids_of_split, open_houses
@@ -42,9 +42,9 @@ class PreparedHouse:
         return house_rays(self.house)
 
     @cached_property
-    def obstacles(self) -> Obstacles:
+    def obstacles(self) -> HouseObstacles:
         """The floor plan that bases must keep clear of."""
-        return obstacles_of(self.house)
+        return HouseObstacles(self.house)
 
 
 @dataclass(eq=False)

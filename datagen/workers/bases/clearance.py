@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -44,16 +45,38 @@ class Obstacles:
         return Obstacles(self.polygons_m[near], self.low_m[near], self.high_m[near], self.floors_m)
 
 
+class Surroundings(Protocol):
+    """Obstacles, or what gives those near positions."""
+
+    def near(self, xy_m: F64, highest_m: float, around_m: float) -> Obstacles:
+        """As `Obstacles.near`."""
+        ...
+
+
+class HouseObstacles:
+    """Every convex part of a house that rises above the floor; few are near a scene and need a footprint."""
+
+    def __init__(self, house: House) -> None:
+        self._parts_m, self._footprints = house.parts_m, dict[int, F64]()
+        self._floors_m = tuple(room.polygon_m for room in house.rooms)
+        self._low_m, self._high_m = (corners_m.astype(np.float64) for corners_m in house.part_boxes_m)
+
+    def near(self, xy_m: F64, highest_m: float, around_m: float) -> Obstacles:
+        """As `Obstacles.near`."""
+        low_m, high_m, known = self._low_m, self._high_m, self._footprints
+        near = (high_m[:, :2] > xy_m.min(0) - around_m).all(1) & (high_m[:, 2] > STEP_M)
+        near &= (low_m[:, :2] < xy_m.max(0) + around_m).all(1) & (low_m[:, 2] < highest_m)
+        rows = np.flatnonzero(near)
+        for k in rows.tolist():
+            if k not in known:
+                known[k] = convex_hull(self._parts_m[k][:, :2])
+        polygons_m = stack_polygons([known[k] for k in rows.tolist()])
+        return Obstacles(polygons_m, low_m[rows, 2], high_m[rows, 2], self._floors_m)
+
+
 def obstacles_of(house: House) -> Obstacles:
-    """Footprints of every convex part of the house that rises above the floor."""
-    low_m, high_m = (corners_m[:, 2] for corners_m in house.part_boxes_m)
-    rows = np.flatnonzero(high_m > STEP_M)
-    return Obstacles(
-        polygons_m=stack_polygons([convex_hull(house.parts_m[k][:, :2]) for k in rows]),
-        low_m=low_m[rows].astype(np.float64),
-        high_m=high_m[rows].astype(np.float64),
-        floors_m=tuple(room.polygon_m for room in house.rooms),
-    )
+    """All obstacles of a house."""
+    return HouseObstacles(house).near(np.zeros((1, 2)), np.inf, np.inf)
 
 
 class Footprint:
@@ -165,7 +188,7 @@ def base_clearance_m(
     base_height_m: F32,
     camera_height_m: F32,
     base_radius_m: F64,
-    obstacles: Obstacles,
+    obstacles: Surroundings,
     mast_radius_m: float,
     footprint: Footprint | None = None,
     yaw_rad: F32 | None = None,

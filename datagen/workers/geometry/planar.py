@@ -66,16 +66,22 @@ def signed_distances_to_convex(points_m: F64, polygons_m: F64) -> F64:
 
 
 def _signed_distances(points_m: F64, polygons_m: F64) -> F64:
+    # Sides come first, and arrays are reused: reductions over a short last axis and new memory are slow.
     first, second = polygons_m, following(polygons_m)
-    along = second - first  # (P, K, 2)
-    length2 = np.maximum((along**2).sum(2), 1e-18)
-    rel = points_m[:, None, None, :] - polygons_m[None]  # (N, P, K, 2)
-    t = np.clip((rel[..., 0] * along[..., 0] + rel[..., 1] * along[..., 1]) / length2, 0.0, 1.0)
-    dx = rel[..., 0] - t * along[..., 0]
-    dy = rel[..., 1] - t * along[..., 1]
-    border = np.sqrt((dx * dx + dy * dy).min(2))
-    left = (along[..., 0] * rel[..., 1] - along[..., 1] * rel[..., 0] >= 0).all(2)
     area = (first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]).sum(1)
+    along_x, along_y = np.ascontiguousarray((second - first).T)[:, :, None]  # (K, 1, P)
+    x, y = points_m.T[:, None, :, None] - np.ascontiguousarray(first.T)[:, :, None]  # (K, N, P)
+    t, other = x * along_x, y * along_y
+    t += other
+    t /= np.maximum(along_x**2 + along_y**2, 1e-18)
+    np.clip(t, 0.0, 1.0, out=t)
+    left = (along_x * y >= np.multiply(along_y, x, out=other)).all(0)
+    x -= np.multiply(t, along_x, out=other)
+    y -= np.multiply(t, along_y, out=other)
+    x *= x
+    y *= y
+    x += y
+    border = np.sqrt(x.min(0))
     return np.where(left & (area > 1e-12), -border, border)
 
 
@@ -136,12 +142,13 @@ def distance_to_border(polygon_m: F64) -> float:
 
 def inside_polygon(points_m: F64, polygon_m: F64) -> npt.NDArray[np.bool_]:
     """Whether points (N, 2) lie in a simple polygon (K, 2), by the even-odd rule."""
-    x, y = points_m[:, None, 0], points_m[:, None, 1]
-    start, end = polygon_m[None], following(polygon_m)[None]
-    spans = (start[..., 1] > y) != (end[..., 1] > y)
-    rise = np.where(spans, end[..., 1] - start[..., 1], 1.0)
-    crossing = start[..., 0] + (y - start[..., 1]) / rise * (end[..., 0] - start[..., 0])
-    return (spans & (x < crossing)).sum(1) % 2 == 1
+    x, y = points_m.T
+    start_x, start_y = polygon_m.T[..., None]  # (K, 1)
+    end_x, end_y = following(polygon_m).T[..., None]
+    spans = (start_y > y) != (end_y > y)
+    rise = np.where(spans, end_y - start_y, 1.0)
+    crossing = start_x + (y - start_y) / rise * (end_x - start_x)
+    return (spans & (x < crossing)).sum(0) % 2 == 1
 
 
 def inside_any(points_m: F64, polygons_m: Sequence[F64]) -> npt.NDArray[np.bool_]:

@@ -223,14 +223,21 @@ def _clear_poses(
     return known[key]
 
 
+_CORES = CacheFolder("cores", most_files=4096)  # about 10 KB each
 _cores: WeakKeyDictionary[ObjectModel, dict[float, Parts]] = WeakKeyDictionary()
 
 
 def _core(model: ObjectModel, depth_m: float) -> Parts:
-    """What lies deeper than `depth_m` in an object's parts; computed once for as long as the model lives."""
+    """What lies deeper than `depth_m` in an object's parts; computed once, and cached."""
     known = _cores.setdefault(model, {})
     if depth_m not in known:
-        known[depth_m] = in_memory(parts_of([[core_of(part, depth_m) for part in model.convex_parts_m]]))
+        parts = [sha256(part.tobytes()).hexdigest() for part in model.convex_parts_m]
+        place = file_digest([code_folder().name, depth_m, *parts])
+        if (stored := _CORES.load(place)) is None:
+            cores = [core_of(part, depth_m) for part in model.convex_parts_m]
+            ends = np.cumsum([len(core) for core in cores])
+            _CORES.store(place, stored := {"points_m": np.concatenate(cores), "ends": ends})
+        known[depth_m] = in_memory(parts_of([np.split(stored["points_m"], stored["ends"][:-1].tolist())]))
     return known[depth_m]
 
 

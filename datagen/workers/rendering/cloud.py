@@ -13,7 +13,8 @@ from datagen.workers.geometry.mesh import F32, F64, U8
 from datagen.workers.rendering import Camera, Frame, Pixels, pixel_directions
 
 PixelCaster = Callable[[npt.NDArray[np.int64]], Pixels]
-_BLOCK = 8192
+_BLOCK = 8192  # pixels cast at once: colours depend on it in their last bits
+_WINDOW_BLOCK = 2048  # of those around the target, of which the first few hundred mostly suffice
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +63,13 @@ def observe_cloud(
     """
     window = rng.permutation(target_pixels(camera, centre_m, radius_m))
     order = rng.permutation(camera.width_px * camera.height_px)
-    found = cast(window)
-    sure = window[found.body == target_body][: params.min_target_points]
+    sure = window[:0]
+    for start in range(0, len(window), _WINDOW_BLOCK):
+        block = window[start : start + _WINDOW_BLOCK]
+        sure = np.append(sure, block[cast(block).body == target_body])
+        if len(sure) >= params.min_target_points:
+            break
+    sure = sure[: params.min_target_points]
     fresh = np.ones(len(order), np.bool_)
     fresh[sure] = False
 

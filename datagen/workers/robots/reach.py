@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from hashlib import sha256
 
 import numpy as np
 
+from datagen.workers.content_cache import CacheFolder, version_of
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.kinematics.tree import KinematicTree, frame_poses
 
 _STARTS = 32
 _SWEEPS = 200
 _SETTLED_M = 1e-9
+_REACHES = CacheFolder("reaches", most_files=4096)  # less than 1 KB each
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +42,14 @@ def largest_reach_m(chain: Chain) -> float:
 # Scaled arms need the same chains again: the bounds of the search for their scale, and its result.
 @lru_cache(maxsize=256)
 def _largest_reach_m(*parts: bytes) -> float:
+    """That of a chain's arrays, computed once on a machine."""
+    key = f"{sha256(b'-'.join(parts)).hexdigest()}-{version_of('numpy')}"
+    if (stored := _REACHES.load(key)) is None:
+        _REACHES.store(key, stored := {"reach_m": np.array(_ascended_m(*parts))})
+    return float(stored["reach_m"])
+
+
+def _ascended_m(*parts: bytes) -> float:
     T, axes, lower_rad, upper_rad, tcp_m = map(np.frombuffer, parts)
     chain = Chain(T.reshape(-1, 4, 4), axes.reshape(-1, 3), lower_rad, upper_rad, tcp_m)
     count = len(chain.axis)

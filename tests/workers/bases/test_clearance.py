@@ -8,7 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.schemas.specification import CandidateParams
-from datagen.workers.bases.clearance import FAR_M, Footprint, Obstacles, base_clearance_m, obstacles_of
+from datagen.workers.bases.clearance import (
+    FAR_M,
+    Footprint,
+    HouseObstacles,
+    Obstacles,
+    Surroundings,
+    base_clearance_m,
+    obstacles_of,
+)
 from datagen.workers.geometry.planar import convex_hull, polygons_at, signed_distances_to_convex
 from datagen.workers.houses.house import House
 from tests.workers.worlds import ROOM_M, TABLE_SIZE_M, box_body, table_house
@@ -77,7 +85,7 @@ def of_outlines(
     footprint: Footprint | None,
     xy: np.ndarray,
     yaw: np.ndarray,
-    obstacles: Obstacles,
+    obstacles: Surroundings,
     radius_m: float = 0.25,
     camera_m: float = 1.2,
 ) -> np.ndarray:
@@ -90,6 +98,17 @@ def poses(seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     xy = rng.uniform((-0.2, -0.2), np.array(ROOM_M) + 0.2, (ROBOTS, 2)).astype(np.float32)
     return xy, rng.uniform(-np.pi, np.pi, ROBOTS).astype(np.float32)
+
+
+@given(st.integers(0, 2**32), st.integers(1, ROBOTS), st.sampled_from([None, Footprint(RIDGEBACK)]))
+@settings(max_examples=30, deadline=None)
+def test_footprints_on_demand_give_the_clearance_of_all(seed: int, n: int, outline: Footprint | None) -> None:
+    (xy, yaw), lamp = poses(seed), box_body("lamp", "furniture", "Lamp", (0.3, 0.3, 0.3), (0.7, 1.5, 0.9))
+    house = table_house([lamp])
+    on_demand = HouseObstacles(house)
+    for rows in (slice(n), slice(None)):
+        some = outline, xy[rows], yaw[rows]
+        np.testing.assert_array_equal(of_outlines(*some, on_demand), of_outlines(*some, obstacles_of(house)))
 
 
 @given(st.integers(0, 2**32), st.floats(0.1, 0.5))

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
+from datagen.workers.content_cache import CacheFolder
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.grasps.grasp_cache import GraspSet
 from datagen.workers.grasps.search import HandClearance
 from datagen.workers.kinematics.compiler import in_memory
-from datagen.workers.motion import PlanReport
+from datagen.workers.kinematics.contacts import parts_of
+from datagen.workers.motion import PlanReport, planning_scene
 from datagen.workers.motion.arm_model import TOUCH_M, core_of, hand_of
 from datagen.workers.motion.hand_motion import OTHER, TARGET, Poses, Room, clear_poses, free_poses, points_on
 from datagen.workers.motion.plan_candidate import plan_candidate
@@ -33,7 +35,7 @@ from tests.workers.motion.tables import (
 )
 from tests.workers.oracles import Hulls
 from tests.workers.robots.robots_under_test import CASES, opened
-from tests.workers.worlds import box_vertices
+from tests.workers.worlds import box_model, box_vertices
 
 FROM_ABOVE = np.flatnonzero(box_grasps().T_object_tcp[:, 2, 2] < -0.5)
 FROM_SIDES = np.flatnonzero(box_grasps().T_object_tcp[:, 2, 2] > -0.5)
@@ -254,3 +256,14 @@ def test_a_turned_grasp_that_cuts_the_target_is_omitted() -> None:
     world = np.matmul(scene.T_world_object[0], every[fits])[:, :3]
     np.testing.assert_allclose(around.arrays.T_world_tcp, world, atol=1e-12)
     assert (around.arrays.is_free > 0).all()
+
+
+def test_a_stored_core_is_the_computed_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planning_scene, "_CORES", CacheFolder("cores-again", 9))
+    monkeypatch.setattr(planning_scene, "in_memory", lambda parts: parts)
+    boxes = [box_model("box", BOX_M) for _ in range(2)]
+    computed = parts_of([[core_of(part, 0.01) for part in boxes[0].convex_parts_m]])
+    for box in boxes:
+        for found, expected in zip(planning_scene._core(box, 0.01), computed, strict=True):
+            np.testing.assert_array_equal(found, expected)
+        monkeypatch.setattr(planning_scene, "core_of", None)  # the second is read

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from datagen.schemas.specification import ObservationParams
+from datagen.workers.rendering import cloud as module
 from datagen.workers.rendering.cloud import Cloud, caster_of, farthest_points, observe_cloud, target_pixels
 from datagen.workers.rendering.embree import cast_pixels, ray_scene, render_rays
 from tests.workers.worlds import ball_model, box_model, camera_at, stage_with
@@ -29,6 +31,14 @@ def test_casting_only_the_drawn_pixels_gives_the_cloud_of_the_whole_frame() -> N
     np.testing.assert_array_equal(sparse.rgb, dense.rgb)
     np.testing.assert_array_equal(sparse.target_mask, dense.target_mask)
     assert sparse.n == dense.n == 1024
+
+
+@pytest.mark.parametrize("block", [2, 7, 300])
+def test_pixels_around_the_target_may_be_cast_in_blocks(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    at_once = observe()
+    monkeypatch.setattr(module, "_WINDOW_BLOCK", block)
+    for name, values in vars(observe()).items():
+        np.testing.assert_array_equal(values, vars(at_once)[name])
 
 
 def test_points_lie_on_the_scene_within_the_crop() -> None:

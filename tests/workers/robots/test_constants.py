@@ -13,10 +13,11 @@ from scipy.spatial import ConvexHull
 pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
 
 from datagen.workers.geometry.planar import inside_polygon
-from datagen.workers.geometry.transforms import inverse
-from datagen.workers.robots import open_robot, robot_limits, robot_source
+from datagen.workers.geometry.transforms import inverse, translation
+from datagen.workers.robots import open_robot, reach, robot_limits, robot_source
 from datagen.workers.robots.assembly import read_trees
 from datagen.workers.robots.hulls import MAX_CORNERS, mesh_hulls, outer_hull, read_points
+from datagen.workers.robots.reach import Chain, largest_reach_m
 from datagen.workers.robots.resources import package_folders
 from datagen.workers.robots.robot_files import write_urdf
 from datagen.workers.robots.urdf import Inertial, UrdfTree, read_urdf, scaled_inertial
@@ -182,3 +183,14 @@ def test_parts_in_written_files_are_those_of_the_links(tmp_path: Path, reach_m: 
             gaps = np.linalg.norm(np.asarray(mesh.vertices)[:, None] - part[None], axis=2)
             assert gaps.min(axis=1).max() < 1e-6
             np.testing.assert_allclose(mesh.bounds, [part.min(axis=0), part.max(axis=0)], atol=1e-6)
+
+
+def test_a_stored_reach_is_the_computed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path))
+    rng = np.random.default_rng(0)
+    T = np.stack([translation(*xyz) for xyz in rng.uniform(-0.3, 0.3, (4, 3))])
+    chain = Chain(T, np.eye(3)[[2, 1, 0, 1]], np.full(4, -2.0), np.full(4, 1.5), np.array([0.1, 0.0, 0.2]))
+    computed = largest_reach_m(chain)
+    reach._largest_reach_m.cache_clear()  # as another process
+    monkeypatch.setattr(reach, "_ascended_m", None)
+    assert largest_reach_m(chain) == computed
