@@ -42,7 +42,7 @@ def crop_at(image: RgbdImage, pixel: tuple[int, int]) -> tuple[F32, npt.NDArray[
 
 
 def _cells_m() -> F64:
-    return (np.arange(CELLS) - CELLS // 2) * CELL_M
+    return np.arange(-CELLS // 2, CELLS - CELLS // 2).astype(np.float64) * CELL_M
 
 
 def channels(away_m: F32, rgb: npt.NDArray[np.uint8], known: Bools, ray: F64, R: F64) -> F32:
@@ -91,9 +91,7 @@ def object_logits(image: RgbdImage, pixel: tuple[int, int], T_world_camera: F64)
 
 @lru_cache(maxsize=1)
 def _weights() -> Weights:
-    return {
-        name: tensor.astype(np.float32) for name, tensor in load_file(released_click_network()).items()
-    }
+    return {name: tensor.astype(np.float32) for name, tensor in load_file(released_click_network()).items()}
 
 
 def network_logits(x: F32, weights: Weights) -> F32:

@@ -1,4 +1,4 @@
-"""Clicks: on a thing they grow to its mask; on a surface of the room they are refused."""
+"""Clicks on a thing give its mask, and on a surface of the room are refused; boxes give what fills them."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from datagen.schemas.errors import InputError
+from datagen.train.prediction.clicks import Box, box_mask, click_mask
 from datagen.train.prediction.frames import Pinhole, RgbdImage
 from datagen.train.prediction.ground import level_pose
-from datagen.train.prediction.region_growing import grow_mask
+from datagen.workers.geometry.transforms import look_at
 from tests.train.prediction.seen_scenes import Seen, sensor_frame
 
 
@@ -34,13 +35,13 @@ def test_a_click_on_the_floor_is_refused_with_what_it_found(noise: bool, seen: S
     said: list[str] = []
     for pixel in level_pixels(seen, -0.01, 0.01):
         try:
-            grow_mask(image_of(shot), pixel, shot.camera.T_world_camera)
+            click_mask(image_of(shot), pixel, shot.camera.T_world_camera)
             said.append("grown")
         except InputError as refused:
             assert refused.field == f"{pixel[0]},{pixel[1]}"
             said.append(str(refused))
     assert sum("its box or mask" in words or "no depth" in words for words in said) >= len(said) - 1, said
-    assert sum("the floor (at least 0." in words for words in said) > len(said) / 2, said
+    assert sum("lies on the floor" in words for words in said) > len(said) / 2, said
 
 
 @pytest.mark.parametrize("noise", [False, True])
@@ -51,7 +52,7 @@ def test_a_click_on_the_target_grows_to_its_mask(noise: bool, seen: Seen) -> Non
     truth = image.mask & (image.depth_m > 0)
     v, u = np.nonzero(truth)
     k = int(np.argmin((v - v.mean()) ** 2 + (u - u.mean()) ** 2))
-    grown = grow_mask(image, (int(u[k]), int(v[k])), shot.camera.T_world_camera)
+    grown = click_mask(image, (int(u[k]), int(v[k])), shot.camera.T_world_camera)
     assert grown.shape == truth.shape
     assert (grown & truth).sum() / (grown | truth).sum() > 0.7
 
@@ -64,7 +65,71 @@ def test_a_wall_and_a_table_are_named() -> None:
     # A table 0.4 m below the camera up to 1.5 m ahead, then a wall.
     depth = np.where(down > 0.4 / 1.5, 0.4 / np.maximum(down, 1e-6), 1.5).astype(np.float32)
     image = RgbdImage(np.zeros((240, 320, 3), np.uint8), depth, pinhole, None)
-    with pytest.raises(InputError, match=r"an upright plane \(at least 0\.\d\d x 0\.\d\d m\)"):
-        grow_mask(image, (160, 80), T)
+    with pytest.raises(InputError, match=r"an upright plane, as of a wall"):
+        click_mask(image, (160, 80), T)
     with pytest.raises(InputError, match=r"a level surface 0\.80 m above the floor"):
-        grow_mask(image, (160, 225), T)
+        click_mask(image, (160, 225), T)
+
+
+EYE_M = np.array([0.0, -0.75, 1.35])
+SOLIDS = {  # low and high corners (m): a table, a block on a wider one, a block alone, and a block too large
+    "table": ((-0.8, -0.5, 0.66), (0.8, 0.5, 0.70)),
+    "lower": ((-0.22, -0.10, 0.70), (-0.04, 0.10, 0.78)),
+    "upper": ((-0.17, -0.04, 0.78), (-0.09, 0.04, 0.88)),
+    "alone": ((0.02, -0.05, 0.70), (0.09, 0.05, 0.79)),
+    "large": ((0.00, 0.20, 0.70), (0.48, 0.45, 0.90)),
+}
+
+
+def table_top(kinect: bool) -> tuple[RgbdImage, np.ndarray, dict[str, np.ndarray]]:
+    """The image of SOLIDS, the camera's pose, and the pixels of each."""
+    pinhole, T = Pinhole(525.0, 525.0, 319.5, 239.5), look_at(EYE_M, np.array([0.0, 0.0, 0.75]))
+    v, u = np.indices((480, 640))
+    rays = np.stack([(u - 319.5) / 525, (v - 239.5) / 525, np.ones((480, 640))], axis=2) @ T[:3, :3].T
+    depth, owner = np.full((480, 640), np.inf), np.full((480, 640), "", dtype="U5")
+    for name, (low, high) in SOLIDS.items():
+        sides = np.stack([(np.array(side) - EYE_M) / rays for side in (low, high)])
+        enter, leave = sides.min(axis=0).max(axis=2), sides.max(axis=0).min(axis=2)
+        first = (enter < leave) & (enter < depth)
+        depth[first], owner[first] = enter[first], name
+    depth[np.isinf(depth)] = 0
+    if kinect:
+        inverse = 1 / np.maximum(depth, 0.1) + np.random.default_rng(0).normal(0, 1.4e-3, depth.shape)
+        depth = np.where(depth > 0, 1 / (np.round(inverse / 2.85e-3) * 2.85e-3), 0)
+    image = RgbdImage(np.zeros((480, 640, 3), np.uint8), depth.astype(np.float32), pinhole, None)
+    return image, T, {name: owner == name for name in SOLIDS}
+
+
+def around(pixels: np.ndarray, margin_px: int = 3) -> Box:
+    v, u = np.nonzero(pixels)
+    left, top, right, bottom = u.min() - margin_px, v.min() - margin_px, u.max() + 1, v.max() + 1
+    return int(left), int(top), int(right + margin_px), int(bottom + margin_px)
+
+
+@pytest.mark.parametrize("kinect", [False, True])
+@pytest.mark.parametrize("name", ["alone", "upper", "lower"])
+def test_a_box_selects_its_object_without_its_support(name: str, kinect: bool) -> None:
+    image, T, owners = table_top(kinect)
+    left, top, right, bottom = around(owners[name])
+    mask = box_mask(image, (left, top, right, bottom), T)
+    assert (mask & owners[name]).sum() / (mask | owners[name]).sum() > 0.6
+    assert (mask & owners["table"]).sum() < 0.1 * mask.sum()
+    v, u = np.nonzero(mask)
+    slack = 3 + 0.05 * max(right - left, bottom - top)
+    assert u.min() > left - slack and u.max() < right + slack
+    assert v.min() > top - slack and v.max() < bottom + slack
+
+
+def test_boxes_without_one_object_are_refused() -> None:
+    image, T, owners = table_top(False)
+    for box, words in (
+        ((10, 10, 700, 50), "no box of 3 pixels or more in the image of 640x480"),
+        ((50, 50, 40, 90), "no box of 3 pixels or more"),
+        (around(owners["large"]), "no object in it that fills it"),
+        ((300, 380, 360, 420), "no object in it that fills it"),
+    ):
+        with pytest.raises(InputError, match=words):
+            box_mask(image, box, T)
+    image.depth_m[300:400, 250:400] = 0
+    with pytest.raises(InputError, match="has no depth"):
+        box_mask(image, (270, 320, 330, 380), T)
