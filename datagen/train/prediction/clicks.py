@@ -6,13 +6,17 @@ import numpy as np
 from scipy import ndimage
 
 from datagen.schemas.errors import InputError
-from datagen.train.inputs import F64, Bools
+from datagen.train.inputs import F32, F64, Bools
 from datagen.train.prediction.click_network import object_logits
-from datagen.train.prediction.frames import RgbdImage
+from datagen.train.prediction.frames import RgbdImage, moved
+from datagen.train.prediction.ground import depth_error_m, floor_points
+from datagen.train.prediction.target import from_nearest
 
 _LARGEST_M = 0.45  # a larger region is furniture, or several objects
 _LEAST_PX = 20
 _NEXT_PX = 2  # a mask may begin this far from the click
+_RING_PX, _OFF_PLANE_M = (3, 9), 0.004  # around a mask, where a plane would continue; its noise at 0 m
+_JUMP_M, _LEAST_SHARE = 0.03, 0.1  # between parts of a region, and the least part that belongs to it
 _PATCH_PX = 12  # around a click on a surface, to say which
 _LEVEL, _UPRIGHT, _ON_FLOOR_M = 0.9, 0.3, 0.04
 # Where in a box an object is looked for, and the least overlap of the object's own box with it.
@@ -39,8 +43,10 @@ def click_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) ->
         near = (depth_m[max(v - 15, 0) : v + 16, max(u - 15, 0) : u + 16] > 0).any()
         fix = "Give another pixel of the target" if near else "Take the frame again, or give its box or mask"
         raise InputError("--click", said, "has no depth", fix)
-    mask = _masked(image, (u, v), T_world_camera)
-    if mask is None:
+    point_m = moved(image.points(np.array([v * w + u])), T_world_camera)
+    on_floor = bool(floor_points(point_m, T_world_camera[:3, 3])[0])
+    mask = None if on_floor else _masked(image, (u, v), T_world_camera)
+    if mask is None or _is_part_of_plane(mask, depth_m):
         raise InputError("--click", said, f"lies on {_surface(image, (u, v), T_world_camera)}", _FIX)
     _refuse_large(image, mask, T_world_camera, "--click", said)
     return mask
@@ -55,8 +61,39 @@ def _masked(image: RgbdImage, pixel: tuple[int, int], T_world_camera: F64) -> Bo
     near = labels[max(v - _NEXT_PX, 0) : v + _NEXT_PX + 1, max(u - _NEXT_PX, 0) : u + _NEXT_PX + 1]
     if not near.any():
         return None
-    mask = labels == np.bincount(near[near > 0]).argmax()
+    mask = _without_specks(labels == np.bincount(near[near > 0]).argmax(), image.depth_m)
     return mask if mask.sum() >= _LEAST_PX else None
+
+
+def _without_specks(mask: Bools, depth_m: F32) -> Bools:
+    """A region less what lies at another depth than its larger parts: pixels of what is behind its rim."""
+    step_m = ndimage.maximum_filter(np.where(mask, depth_m, 0), 3)
+    step_m = step_m - ndimage.minimum_filter(np.where(mask, depth_m, np.inf), 3)
+    parts = np.zeros(mask.shape, np.int64)
+    ndimage.label(mask & (step_m < _JUMP_M), np.ones((3, 3)), output=parts)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    large = sizes[parts] >= _LEAST_SHARE * mask.sum()
+    return mask & (np.abs(depth_m - from_nearest(depth_m, large)) < _JUMP_M) if large.any() else mask
+
+
+def _is_part_of_plane(mask: Bools, depth_m: F32) -> bool:
+    """Whether a region is a patch of a plane that continues around it.
+
+    On a plane the inverse of depth is linear.
+    """
+    near, next_to = (np.asarray(ndimage.binary_dilation(mask, iterations=n), np.bool_) for n in _RING_PX)
+    inside, around = (np.argwhere(pixels & (depth_m > 0)) for pixels in (mask, next_to & ~near))
+    if len(around) < _LEAST_PX:
+        return False
+    there_m, beyond_m = depth_m[tuple(inside.T)], depth_m[tuple(around.T)]
+    plane = np.linalg.lstsq(np.insert(inside, 2, 1, axis=1), 1 / there_m, rcond=None)[0]
+    most_m = _OFF_PLANE_M + 2 * float(depth_error_m(there_m).mean())
+    flat, same = (
+        np.mean(np.abs(1 / np.maximum(np.insert(at, 2, 1, axis=1) @ plane, 1e-3) - m) < most_m)
+        for at, m in ((inside, there_m), (around, beyond_m))
+    )
+    return bool(flat > 0.85 and same > 0.7)
 
 
 def box_mask(image: RgbdImage, box: Box, T_world_camera: F64) -> Bools:
