@@ -28,7 +28,7 @@ Weights = Mapping[str, F32]
 
 
 def crop_at(image: RgbdImage, pixel: tuple[int, int]) -> tuple[F32, npt.NDArray[np.uint8], Bools]:
-    """Depth (N, N) less that of pixel (u, v), colour (N, N, 3) and whether there is depth (N, N)."""
+    """Depth (N, N) less that of pixel (u, v) (m), colour (N, N, 3) and whether there is depth (N, N)."""
     (u, v), (h, w), p = pixel, image.depth_m.shape, image.pinhole
     columns, rows = (
         np.rint(at + _cells_m() / image.depth_m[v, u] * f).astype(int)
@@ -48,7 +48,8 @@ def _cells_m() -> F64:
 def channels(away_m: F32, rgb: npt.NDArray[np.uint8], known: Bools, ray: F64, R: F64) -> F32:
     """Channels (CHANNELS, N, N) of a crop as `crop_at` returns it.
 
-    `ray` (3,) is the clicked point in the camera's frame, `R` (3, 3) the rotation from it to one with z up.
+    `ray` (3,) is the clicked point (m) in the camera's frame (x right, y down, z ahead), `R` (3, 3) the
+    rotation from it to a frame with z up.
     """
     cell, z = _cells_m(), ray[2]
     ahead, top = R[:2, 2], -R[:2, 1]

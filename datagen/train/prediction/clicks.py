@@ -48,7 +48,7 @@ def click_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) ->
     mask = None if on_floor else _masked(image, (u, v), T_world_camera)
     if mask is None or _is_part_of_plane(mask, depth_m):
         raise InputError("--click", said, f"lies on {_surface(image, (u, v), T_world_camera)}", _FIX)
-    _refuse_large(image, mask, T_world_camera, "--click", said)
+    refuse_large(image, mask, T_world_camera, "--click", said)
     return mask
 
 
@@ -115,35 +115,33 @@ def box_mask(image: RgbdImage, box: Box, T_world_camera: F64) -> Bools:
         raise InputError("--box", text, "has no depth", "Take the frame again, or give the target's mask")
     size = right - left, bottom - top
     nearest = {int(np.hypot(u - x * size[0], v - y * size[1]).argmin()) for x, y in _PLACES}
-    masks = [_masked(image, (left + int(u[k]), top + int(v[k])), T_world_camera) for k in sorted(nearest)]
-    overlap, _, mask = max(
-        (
-            (_overlap(mask, (left, top, right, bottom)), -k, mask)
-            for k, mask in enumerate(masks)
-            if mask is not None
-        ),
-        default=(0.0, 0, image.depth_m > 0),
-    )
-    if overlap < _LEAST_OVERLAP:
+    best, cut = 0.0, np.zeros(image.depth_m.shape, np.bool_)
+    for k in sorted(nearest):
+        mask = _masked(image, (left + int(u[k]), top + int(v[k])), T_world_camera)
+        if mask is None or mask[top:bottom, left:right].sum() < _LEAST_PX:
+            continue
+        if (overlap := _overlap(mask, (left, top, right, bottom))) > best:
+            best, cut[:] = overlap, False
+            cut[top:bottom, left:right] = mask[top:bottom, left:right]
+    if best < _LEAST_OVERLAP:
         fix = "Give the sides of a box around the target, or its mask"
         raise InputError("--box", text, "has no object in it that fills it", fix)
-    cut = np.zeros_like(mask)
-    cut[top:bottom, left:right] = mask[top:bottom, left:right]
-    _refuse_large(image, cut, T_world_camera, "--box", text)
+    refuse_large(image, cut, T_world_camera, "--box", text)
     return cut
 
 
 def _overlap(mask: Bools, box: Box) -> float:
     """Intersection over union of a mask's box with another."""
-    (top, *_, bottom), (left, *_, right) = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
-    across = min(int(right) + 1, box[2]) - max(int(left), box[0])
-    down = min(int(bottom) + 1, box[3]) - max(int(top), box[1])
+    rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
+    left, top, right, bottom = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+    across = min(right, box[2]) - max(left, box[0])
+    down = min(bottom, box[3]) - max(top, box[1])
     both = max(across, 0) * max(down, 0)
-    areas = (right + 1 - left) * (bottom + 1 - top) + (box[2] - box[0]) * (box[3] - box[1])
-    return both / float(areas - both)
+    areas = (right - left) * (bottom - top) + (box[2] - box[0]) * (box[3] - box[1])
+    return both / (areas - both)
 
 
-def _refuse_large(image: RgbdImage, mask: Bools, T_world_camera: F64, option: str, value: str) -> None:
+def refuse_large(image: RgbdImage, mask: Bools, T_world_camera: F64, option: str, value: str) -> None:
     """Raise InputError where a mask is that of furniture or of several objects."""
     points_m = image.points(np.flatnonzero(mask)) @ T_world_camera[:3, :3].T
     low, high = np.percentile(points_m, (2, 98), axis=0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from datagen.schemas.errors import InputError
-from datagen.train.prediction.clicks import Box, box_mask, click_mask
+from datagen.train.prediction.clicks import Box, box_mask, click_mask, refuse_large
 from datagen.train.prediction.frames import Pinhole, RgbdImage
 from datagen.train.prediction.ground import level_pose
 from datagen.workers.geometry.transforms import look_at
@@ -133,3 +133,46 @@ def test_boxes_without_one_object_are_refused() -> None:
     image.depth_m[300:400, 250:400] = 0
     with pytest.raises(InputError, match="has no depth"):
         box_mask(image, (270, 320, 330, 380), T)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_any_depth_gives_a_mask_or_one_line(seed: int) -> None:
+    """Noise, stripes and holes at any distance: a mask with the click or in the box, or an InputError."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(0.05, 8) + rng.normal(0, 10 ** rng.uniform(-4, 0), (90, 120))
+    depth[:, :: rng.integers(1, 9)] += rng.choice([0.0, 0.05, 1.0])
+    depth = np.where(rng.random(depth.shape) < rng.uniform(0, 0.9), 0, depth.clip(0)).astype(np.float32)
+    rgb = rng.integers(0, 255, (90, 120, 3), dtype=np.uint8)
+    image = RgbdImage(rgb, depth, Pinhole(150.0, 150.0, 59.5, 44.5), None)
+    T = look_at(EYE_M, np.array([0.0, 0.0, rng.uniform(-1, 3)]))
+    u, v = int(rng.integers(120)), int(rng.integers(90))
+    left, top = int(rng.integers(110)), int(rng.integers(80))
+    box = left, top, int(rng.integers(left + 3, 121)), int(rng.integers(top + 3, 91))
+    for select, place in ((click_mask, (u, v)), (box_mask, box)):
+        try:
+            mask = select(image, place, T)
+        except InputError as refused:
+            assert refused.field and refused.problem and "\n" not in str(refused)
+            continue
+        assert mask.any() and (depth[mask] > 0).all()
+        if select is box_mask:
+            assert not mask[:, :left].any() and not mask[:top].any()
+            assert not mask[:, box[2] :].any() and not mask[box[3] :].any()
+
+
+def test_a_region_that_no_hand_can_grasp_is_refused_with_its_size() -> None:
+    """Of a plane 1 m ahead of a level camera, 300 pixels to the metre."""
+    image = RgbdImage(
+        np.zeros((240, 320, 3), np.uint8),
+        np.ones((240, 320), np.float32),
+        Pinhole(300.0, 300.0, 159.5, 119.5),
+        None,
+    )
+    T, mask = level_pose(np.array([0.0, -1.0, 0.0]), 1.2), np.zeros((240, 320), np.bool_)
+    mask[100:130, 100:220] = True
+    refuse_large(image, mask, T, "--click", "160,115")
+    mask[100:130, 80:240] = True
+    with pytest.raises(
+        InputError, match=r"--click: 160,115: selects a region 0\.5\d m wide and 0\.\d\d m high"
+    ):
+        refuse_large(image, mask, T, "--click", "160,115")
