@@ -17,6 +17,7 @@ from tests.workers.objects.folder_files import box, cup, write_as
 STL = box(0.04, 0.05, 0.06).export(file_type="stl")
 PLY = box(0.04, 0.05, 0.06).export(file_type="ply", encoding="ascii")
 GLB = box(0.04, 0.05, 0.06).export(file_type="glb")
+GLTF = box(0.04, 0.05, 0.06).export(file_type="gltf")["model.gltf"]
 URDF = '<robot name="a"><link name="l"><visual><geometry>{}</geometry></visual></link>{}</robot>'
 BOX = '<box size="0.04 0.05 0.06"/>'
 BALL = '<geom size="0.03"/>'
@@ -52,6 +53,10 @@ BAD: dict[str, tuple[str, str | bytes, str]] = {
     "ply without faces": ("a.ply", _ply(b"element face 12", b"element face 0"), ""),
     "glb cut off": ("a.glb", GLB[: len(GLB) // 2], ""),
     "glb of another kind": ("a.glb", b"PK\x03\x04" + bytes(100), "zip file"),
+    "gltf cut off": ("a.gltf", GLTF[: len(GLTF) // 2], ""),
+    "gltf of another kind": ("a.gltf", GLB, "binary glTF file"),
+    "gltf without its buffer": ("a.gltf", GLTF, "cannot be read"),
+    "gltf of a buffer outside": ("a.gltf", GLTF.replace(b"gltf_buffer_0", b"../../x"), "not inside"),
     "msh header": ("a.xml", MJCF.format(OF_MESH, '<geom type="mesh" mesh="m"/>'), "a.msh"),
     "flat": ("a.obj", "v 0 0 0\nv .1 0 0\nv .1 .1 0\nv 0 .1 0\nf 1 2 3\nf 1 3 4\n", "no volume"),
     "too small": ("a.stl", box(0.001, 0.001, 0.001).export(file_type="stl"), "wrong size"),
