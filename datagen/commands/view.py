@@ -5,9 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from cyclopts import Parameter
@@ -23,6 +24,7 @@ _MOST = 10  # scenes in a file
 
 def view(
     run: RunPath, /, *, scene: Whole | None = None, place: str | None = None, outcome: str | None = None,
+    disagreement: Literal["heuristic", "plan"] | None = None,
     target: Annotated[str, Parameter(name="--object")] = "",
     out: Path | None = None, given: AssetSources = AS_FOUND,
 ) -> int:  # fmt: skip
@@ -30,12 +32,14 @@ def view(
 
     Needs the extra rerun. Where there is no display, `--out` writes a file for `rerun FILE.rrd`.
 
-    For example: datagen view runs/first --object banana --place shelf --outcome success
+    For example: datagen view runs/first --object banana --place shelf --disagreement heuristic
 
     Args:
         scene: Index of a scene.
         place: Kind of place: top, shelf, inside, seat, floor or sink.
         outcome: Outcome of at least one candidate (plan, sim).
+        disagreement: What the label of at least one candidate differs from: heuristic (plan, sim), or plan,
+            where the trial of a plan failed (sim).
         target: Part of the target's name.
         out: File to write, FILE.rrd, in place of opening the viewer.
     """
@@ -51,12 +55,16 @@ def view(
             fix = choices(valid, value) if valid else f"Omit --{name}: the run has none"
             raise InputError(f"--{name}", value[:40], "is unknown", fix)
         wanted |= {} if value is None else {name: codes[name].index(value)}
+    if disagreement and {"heuristic": "heuristic_label", "plan": "attempts"}[disagreement] not in codes:
+        fix = "Omit --disagreement, or give a run of labels of higher fidelity"
+        raise InputError("--disagreement", disagreement, "is not known of the run's labels", fix)
     every = enumerate(source.scenes(source.first, source.past), source.first)
     fitting = (
         (k, of, rows)
         for k, (of, rows) in every
         if target in str(rows.record["object_name"][0])
         and all(np.isin(code, {**rows.record, **rows.samples}[name]) for name, code in wanted.items())
+        and (disagreement is None or _disagrees(rows.samples, disagreement))
     )
     scenes = list(islice(fitting, _MOST))
     if not scenes:
@@ -66,3 +74,9 @@ def view(
         file = out or Path(folder) / "scenes.rrd"
         file.write_bytes(joined([recording(source, of, rows).data for _, of, rows in scenes]))
         return 0 if out else min(subprocess.call([sys.executable, "-m", "rerun", str(file)]), 1)
+
+
+def _disagrees(samples: Mapping[str, Any], other: str) -> bool:
+    """Whether the label of a candidate differs from that of the heuristic, or from whether it was planned."""
+    labels = samples["heuristic_label"] if other == "heuristic" else samples["trials"] > 0
+    return bool((labels != samples["label"]).any())
