@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import struct
+import subprocess
+import sys
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
+import trimesh
 
 from datagen.schemas.errors import InputError
 from datagen.workers.objects import decomposition, open_objects, surfaces
@@ -177,6 +185,31 @@ def test_a_decomposition_that_fails_costs_its_object(
     fault(monkeypatch)
     source = open_objects(f"folder:{tmp_path}")
     assert source.names() == ["box"] and named in source.excluded["cup"]
+
+
+def test_a_decomposition_ends_with_the_program_that_a_signal_ends(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    ball.vertices *= 0.04 + 0.01 * np.sin(9 * ball.vertices).prod(axis=1, keepdims=True)  # for some seconds
+    write_as("stl", ball, tmp_path / "ball")
+    environment = {**os.environ, "DATAGEN_CACHE": str(tmp_path / "cache")}
+    words = [sys.executable, "-m", "datagen.cli", "assets", "check", str(tmp_path / "ball")]
+    with subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL) as process:
+        child = _decomposing(psutil.Process(process.pid))
+        process.terminate()
+    assert process.returncode == -signal.SIGTERM
+    child.wait(5)
+
+
+def _decomposing(parent: psutil.Process) -> psutil.Process:
+    """The child that has loaded CoACD."""
+    until = time.monotonic() + 60
+    while time.monotonic() < until:
+        for child in parent.children():
+            with suppress(psutil.Error):
+                if any("coacd" in file.path for file in child.memory_maps()):
+                    return child
+        time.sleep(0.02)
+    raise AssertionError("nothing was decomposed")
 
 
 @pytest.mark.slow
