@@ -5,10 +5,9 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from cyclopts import Parameter
@@ -55,16 +54,17 @@ def view(
             fix = choices(valid, value) if valid else f"Omit --{name}: the run has none"
             raise InputError(f"--{name}", value[:40], "is unknown", fix)
         wanted |= {} if value is None else {name: codes[name].index(value)}
-    if disagreement and {"heuristic": "heuristic_label", "plan": "attempts"}[disagreement] not in codes:
-        fix = "Omit --disagreement, or give a run of labels of higher fidelity"
-        raise InputError("--disagreement", disagreement, "is not known of the run's labels", fix)
+    column = {"heuristic": "heuristic_label", "plan": "trials"}.get(disagreement or "", "label")
+    if column not in codes or disagreement == source.runs[0].manifest.spec.label_source:
+        fix = f"Omit --disagreement: the run has no labels of {disagreement} beside its own"
+        raise InputError("--disagreement", str(disagreement), "is unknown", fix)
     every = enumerate(source.scenes(source.first, source.past), source.first)
     fitting = (
         (k, of, rows)
         for k, (of, rows) in every
         if target in str(rows.record["object_name"][0])
         and all(np.isin(code, {**rows.record, **rows.samples}[name]) for name, code in wanted.items())
-        and (disagreement is None or _disagrees(rows.samples, disagreement))
+        and (disagreement is None or ((rows.samples[column] > 0) != rows.samples["label"]).any())
     )
     scenes = list(islice(fitting, _MOST))
     if not scenes:
@@ -74,9 +74,3 @@ def view(
         file = out or Path(folder) / "scenes.rrd"
         file.write_bytes(joined([recording(source, of, rows).data for _, of, rows in scenes]))
         return 0 if out else min(subprocess.call([sys.executable, "-m", "rerun", str(file)]), 1)
-
-
-def _disagrees(samples: Mapping[str, Any], other: str) -> bool:
-    """Whether the label of a candidate differs from that of the heuristic, or from whether it was planned."""
-    labels = samples["heuristic_label"] if other == "heuristic" else samples["trials"] > 0
-    return bool((labels != samples["label"]).any())

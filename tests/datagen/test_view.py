@@ -15,7 +15,6 @@ from tests.refusals import refused
 from tests.sim_extra import needs_sim
 from tests.small_runs import arrays_of
 
-
 needs_rerun = pytest.mark.skipif(
     find_spec("rerun") is None, reason="the extra `rerun` is not installed: 500 MB"
 )
@@ -48,7 +47,7 @@ def test_the_chosen_scenes_are_in_one_file(
         assert len(stores := reader.recordings()) == len(wanted)
         assert all("/cloud" in {c.entity_path for c in reader.stream(store=store)} for store in stores)
     refused([*words, "--place", "roof"], capsys, "--place: roof", "Choose one of: floor, inside")
-    refused([*words, "--disagreement", "heuristic"], capsys, "--disagreement: heuristic", "is not known")
+    refused([*words, "--disagreement", "heuristic"], capsys, "--disagreement: heuristic", "beside its own")
     refused([*words, "--outcome", "success"], capsys, "--outcome: success", "the run has none")
     refused([*words, "--object", "piano"], capsys, "no scene has all of these", "Give fewer filters")
     refused([*words[:-1], str(tmp_path / "scenes.png")], capsys, "is not a .rrd file")
@@ -76,4 +75,4 @@ def test_scenes_are_chosen_by_what_their_labels_disagree_with(
                 refused(words, capsys, "no scene has all of these")
     assert seen == {False, True}
     words = ["view", str(paired["plan"]), "--out", str(tmp_path / "a.rrd"), "--disagreement", "plan"]
-    refused(words, capsys, "--disagreement: plan", "is not known of the run's labels")
+    refused(words, capsys, "--disagreement: plan", "the run has no labels of plan beside")

@@ -62,7 +62,7 @@ def read_pieces(path: Path, kind: str, resolver: Any = None) -> list[Any]:
     if kind in ("glb", "gltf"):
         refuse_other_kind(path, data, "a binary glTF file" if kind == "glb" else "text", _FIX)
         _check_description(path, _description(path, data) if kind == "glb" else data)
-        options = {"skip_materials": False}
+        options = dict[str, Any](skip_materials=False)
     scene = cast(Any, trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, **options))
     placed = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
     # Counted before meshes are copied for each instance.
