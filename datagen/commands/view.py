@@ -7,7 +7,7 @@ import sys
 import tempfile
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from cyclopts import Parameter
@@ -23,6 +23,7 @@ _MOST = 10  # scenes in a file
 
 def view(
     run: RunPath, /, *, scene: Whole | None = None, place: str | None = None, outcome: str | None = None,
+    disagreement: Literal["heuristic", "plan"] | None = None,
     target: Annotated[str, Parameter(name="--object")] = "",
     out: Path | None = None, given: AssetSources = AS_FOUND,
 ) -> int:  # fmt: skip
@@ -30,12 +31,14 @@ def view(
 
     Needs the extra rerun. Where there is no display, `--out` writes a file for `rerun FILE.rrd`.
 
-    For example: datagen view runs/first --object banana --place shelf --outcome success
+    For example: datagen view runs/first --object banana --place shelf --disagreement heuristic
 
     Args:
         scene: Index of a scene.
         place: Kind of place: top, shelf, inside, seat, floor or sink.
         outcome: Outcome of at least one candidate (plan, sim).
+        disagreement: What the label of at least one candidate differs from: heuristic (plan, sim), or plan,
+            where the trial of a plan failed (sim).
         target: Part of the target's name.
         out: File to write, FILE.rrd, in place of opening the viewer.
     """
@@ -51,12 +54,17 @@ def view(
             fix = choices(valid, value) if valid else f"Omit --{name}: the run has none"
             raise InputError(f"--{name}", value[:40], "is unknown", fix)
         wanted |= {} if value is None else {name: codes[name].index(value)}
+    column = {"heuristic": "heuristic_label", "plan": "trials"}.get(disagreement or "", "label")
+    if column not in codes or disagreement == source.runs[0].manifest.spec.label_source:
+        fix = f"Omit --disagreement: the run has no labels of {disagreement} beside its own"
+        raise InputError("--disagreement", str(disagreement), "is unknown", fix)
     every = enumerate(source.scenes(source.first, source.past), source.first)
     fitting = (
         (k, of, rows)
         for k, (of, rows) in every
         if target in str(rows.record["object_name"][0])
         and all(np.isin(code, {**rows.record, **rows.samples}[name]) for name, code in wanted.items())
+        and (disagreement is None or ((rows.samples[column] > 0) != rows.samples["label"]).any())
     )
     scenes = list(islice(fitting, _MOST))
     if not scenes:

@@ -10,7 +10,14 @@ import pytest
 from datagen import cli
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_scene
+from tests.datagen.conftest import FEW_GRASPS, PAIRED
 from tests.refusals import refused
+from tests.sim_extra import needs_sim
+from tests.small_runs import arrays_of
+
+needs_rerun = pytest.mark.skipif(
+    find_spec("rerun") is None, reason="the extra `rerun` is not installed: 500 MB"
+)
 
 
 @pytest.mark.skipif(find_spec("rerun") is not None, reason="Rerun is installed")
@@ -18,7 +25,7 @@ def test_without_rerun_one_line_names_the_extra(finished: Path, capsys: pytest.C
     refused(["view", str(finished)], capsys, "rerun", "is not installed", "Install the extra rerun")
 
 
-@pytest.mark.skipif(find_spec("rerun") is None, reason="the extra `rerun` is not installed: 500 MB")
+@needs_rerun
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_the_chosen_scenes_are_in_one_file(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -40,6 +47,32 @@ def test_the_chosen_scenes_are_in_one_file(
         assert len(stores := reader.recordings()) == len(wanted)
         assert all("/cloud" in {c.entity_path for c in reader.stream(store=store)} for store in stores)
     refused([*words, "--place", "roof"], capsys, "--place: roof", "Choose one of: floor, inside")
+    refused([*words, "--disagreement", "heuristic"], capsys, "--disagreement: heuristic", "beside its own")
     refused([*words, "--outcome", "success"], capsys, "--outcome: success", "the run has none")
     refused([*words, "--object", "piano"], capsys, "no scene has all of these", "Give fewer filters")
     refused([*words[:-1], str(tmp_path / "scenes.png")], capsys, "is not a .rrd file")
+
+
+@needs_rerun
+@needs_sim
+def test_scenes_are_chosen_by_what_their_labels_disagree_with(
+    paired: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, slippery = tmp_path / "arm.toml", tmp_path / "slippery"
+    slips = "[arm.trial]\nobject_friction = 0\nfinger_friction = 0\n"
+    config.write_text(f"{FEW_GRASPS}{slips}[heuristic]\ntau = 0\n")
+    source = ["--scenes-from", str(paired["heuristic"]), "--config", str(config), "--workers", "0"]
+    assert cli.run(["submit", "sim", "--n", str(PAIRED), "--out", str(slippery), *source]) == 0
+    planned, seen = arrays_of(paired["plan"])["label"], set[bool]()
+    for run in (paired["sim"], slippery):
+        labels = arrays_of(run)
+        for other, values in (("heuristic", labels["heuristic_label"]), ("plan", planned)):
+            words = ["view", str(run), "--out", str(tmp_path / "a.rrd"), "--disagreement", other]
+            seen.add(differs := bool((values != labels["label"]).any()))
+            if differs:
+                assert cli.run(words) == 0
+            else:
+                refused(words, capsys, "no scene has all of these")
+    assert seen == {False, True}
+    words = ["view", str(paired["plan"]), "--out", str(tmp_path / "a.rrd"), "--disagreement", "plan"]
+    refused(words, capsys, "--disagreement: plan", "the run has no labels of plan beside")

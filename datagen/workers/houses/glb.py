@@ -1,4 +1,4 @@
-"""Meshes from binary glTF files, within limits, with textures reduced to one colour per face."""
+"""Meshes from glTF files, within limits, with textures reduced to one colour per face."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def read_glb(path: Path) -> Mesh:
 
 
 def read_pieces(path: Path, kind: str, resolver: Any = None) -> list[Any]:
-    """The meshes of trimesh that a file of a kind ("glb", "ply", ..) holds, each placed as in its scene.
+    """The meshes of trimesh that a file of a kind ("glb", "gltf", ..) holds, each placed as in its scene.
 
     From memory: of other files only what `resolver` gives is read. Raises InputError as `read_glb` does, or
     one of `DAMAGE`.
@@ -58,11 +58,11 @@ def read_pieces(path: Path, kind: str, resolver: Any = None) -> list[Any]:
     # Imported here: only AI2-THOR houses, robots and some objects need it.
     import trimesh
 
-    data = read_regular(path, MAX_FILE_BYTES, _FIX)
-    if kind == "glb":
-        refuse_other_kind(path, data, "a binary glTF file", _FIX)
-        _check_header(path, data)
-    options: dict[str, Any] = {"skip_materials": False} if kind == "glb" else {"process": False}
+    data, options = read_regular(path, MAX_FILE_BYTES, _FIX), dict[str, Any](process=False)
+    if kind in ("glb", "gltf"):
+        refuse_other_kind(path, data, "a binary glTF file" if kind == "glb" else "text", _FIX)
+        _check_description(path, _description(path, data) if kind == "glb" else data)
+        options = dict[str, Any](skip_materials=False)
     scene = cast(Any, trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, **options))
     placed = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
     # Counted before meshes are copied for each instance.
@@ -73,14 +73,18 @@ def read_pieces(path: Path, kind: str, resolver: Any = None) -> list[Any]:
     raise InputError(path, "", problem, _FIX)
 
 
-def _check_header(path: Path, data: bytes) -> None:
-    """Raise InputError for counts in the header beyond the limits, before anything is unpacked."""
+def _description(path: Path, data: bytes) -> bytes:
+    """The JSON document of a binary glTF file. InputError where it is none."""
     if len(data) < 20 or data[:4] != b"glTF" or data[16:20] != b"JSON":
         raise InputError(path, "", "is not a binary glTF file", _FIX)
-    length = int.from_bytes(data[12:16], "little")
-    if length > _MAX_JSON_BYTES:
-        raise InputError(path, "", f"has a description of {length:,} bytes", _FIX)
-    root = parse_json(data[20 : 20 + length], str(path))
+    return data[20 : 20 + int.from_bytes(data[12:16], "little")]
+
+
+def _check_description(path: Path, text: bytes) -> None:
+    """Raise InputError for counts beyond the limits, before anything is unpacked."""
+    if len(text) > _MAX_JSON_BYTES:
+        raise InputError(path, "", f"has a description of {len(text):,} bytes", _FIX)
+    root = parse_json(text, str(path))
     try:
         if packed := _COMPRESSED.intersection(root.value.get("extensionsRequired", [])):
             fix = "Fetch uncompressed meshes, or decompress them, as gltf-transform does"

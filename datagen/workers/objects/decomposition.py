@@ -27,7 +27,8 @@ _SETTINGS = {
 _LONGEST_S = 600.0
 LATE = "has no convex parts after"
 _PROGRAM = """
-import io, json, sys
+import ctypes, io, json, sys
+ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL: end where the parent does
 import coacd, numpy as np
 given = np.load(io.BytesIO(sys.stdin.buffer.read()))
 coacd.set_log_level("off")

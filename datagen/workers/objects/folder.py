@@ -25,6 +25,7 @@ from datagen.workers.objects.model import LoadedOnce, ObjectModel, ObjectSource
 from datagen.workers.objects.object_files import TABLE, ObjectFiles, find_objects
 from datagen.workers.objects.object_reading import GIVEN, Given, read_object
 from datagen.workers.objects.scan import CACHE, model_of, restored_scan, stored_scan
+from datagen.workers.objects.surfaces import SUFFIXES
 from datagen.workers.objects.ycb import INDEXES, YcbObjects
 from datagen.workers.source_statement import read_statement
 
@@ -56,7 +57,7 @@ class FolderObjects(LoadedOnce):
         files, tree = find_objects(folder)
         self._files = {entry.name: entry for entry in files}
         self._table = _read_table(folder / TABLE, {*self._files, ALL})
-        key = digest_of([tree, [*self._files], VERSION, versions_of(_LIBRARIES)])
+        key = digest_of([tree, [*self._files], SUFFIXES, VERSION, versions_of(_LIBRARIES)])
         stored = _LISTS.load(key)
         if stored is None:
             with ThreadPoolExecutor(os.cpu_count()) as pool:

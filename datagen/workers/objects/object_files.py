@@ -16,7 +16,7 @@ from datagen.workers.objects.surfaces import SUFFIXES
 
 TABLE = "objects.csv"
 DESCRIPTIONS = (".urdf", ".xml", ".sdf")
-_HASHED = (*SUFFIXES, *DESCRIPTIONS, ".mtl", ".png", ".jpg", ".jpeg", ".csv")
+_HASHED = (*SUFFIXES, *DESCRIPTIONS, ".mtl", ".bin", ".png", ".jpg", ".jpeg", ".csv")
 _MOST_FILES, _MOST_BYTES = 200_000, 512 << 20
 _START_BYTES = 4096
 # File names that say what a file is for; the object is named by its folder. The first is the best.

@@ -1,4 +1,4 @@
-"""Surfaces of mesh files with their colours: OBJ, GLB, PLY, STL, COLLADA and MuJoCo's MSH."""
+"""Surfaces of mesh files with their colours: OBJ, glTF, PLY, STL, COLLADA and MuJoCo's MSH."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +29,7 @@ from datagen.workers.objects.texture import (
 
 I64 = npt.NDArray[np.int64]
 
-SUFFIXES = (".glb", ".obj", ".dae", ".ply", ".stl", ".msh")
+SUFFIXES = (".glb", ".gltf", ".obj", ".dae", ".ply", ".stl", ".msh")
 _MAX_BYTES = 256 << 20
 _FARTHEST = 1e6
 _FIX = "Export the mesh again"
@@ -129,7 +130,7 @@ class SurfaceReader:
             elif kind == ".msh":
                 surface = _msh(path)
             elif kind in SUFFIXES:
-                pieces = read_pieces(path, kind[1:], _Images(self, path))
+                pieces = read_pieces(path, kind[1:], _Beside(self, path))
                 surface = joined([self._piece(path, piece) for piece in pieces])
                 surface = surface.moved(*_frame(path, kind))
             else:
@@ -211,14 +212,21 @@ class SurfaceReader:
         return replace(surface, uv=corners, image=np.zeros(len(surface.faces), np.int64), images=(pixels,))
 
 
-class _Images:
-    """What trimesh asks for the images of a COLLADA file; other files are not read."""
+class _Beside:
+    """What trimesh asks for the images and buffers of a mesh; other files are not read."""
 
     def __init__(self, reader: SurfaceReader, mesh: Path) -> None:
-        self.reader, self.mesh = reader, mesh
+        self.reader, self.mesh, self.left_bytes = reader, mesh, _MAX_BYTES
+
+    def __getitem__(self, name: str) -> bytes:
+        return self.get(unquote(name))  # glTF names files by URIs
 
     def get(self, name: str) -> bytes:
-        """A PNG of the image, grey where it is missing."""
+        """A buffer, or a PNG of the image, grey where it is missing. InputError for a missing buffer."""
+        if name.lower().endswith(".bin"):
+            data = read_regular(self.reader.inside(self.mesh.parent / name), self.left_bytes, _FIX)
+            self.left_bytes -= len(data)
+            return data
         pixels = self.reader.image(self.mesh, name) if name[-4:].lower() in (".png", ".jpg", "jpeg") else None
         out = io.BytesIO()
         Image.fromarray(np.full((1, 1, 3), 178, np.uint8) if pixels is None else pixels).save(out, "PNG")
@@ -228,7 +236,7 @@ class _Images:
 def _frame(path: Path, kind: str) -> tuple[F64, float]:
     """How the frame that a format states leads to z up and metres."""
     if kind != ".dae":
-        return (_Y_UP if kind == ".glb" else np.eye(4)), 1.0
+        return (_Y_UP if kind in (".glb", ".gltf") else np.eye(4)), 1.0
     from collada import Collada
 
     about: Any = Collada(str(path), ignore=[Exception]).assetInfo

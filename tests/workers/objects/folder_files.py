@@ -38,6 +38,9 @@ def write_as(kind: str, mesh: trimesh.Trimesh, home: Path, mass_kg: float = 0.2)
         (mesh.copy().apply_scale(1000)).export(home / f"{stem}.stl")
     elif kind == "glb":
         mesh.copy().apply_transform(_Y_UP).export(home / f"{stem}.glb")
+    elif kind == "gltf":
+        for name, data in mesh.copy().apply_transform(_Y_UP).export(file_type="gltf").items():
+            (home / name).write_bytes(data)
     elif kind == "y.obj":
         mesh.copy().apply_transform(_Y_UP).export(home / f"{stem}.obj")
     elif kind == "msh":

@@ -20,7 +20,7 @@ from datagen.workers.objects.folder import FolderObjects
 from tests.workers.objects.folder_files import box, cup, write_as, write_gso
 from tests.workers.objects.toy_set import CUBE_OBJ, texture_png, write_bundle, write_maniskill
 
-KINDS = ("obj", "ply", "stl", "mm.stl", "glb", "y.obj", "urdf", "sdf", "mjcf", "msh")
+KINDS = ("obj", "ply", "stl", "mm.stl", "glb", "gltf", "y.obj", "urdf", "sdf", "mjcf", "msh")
 STATED = ("urdf", "sdf", "mjcf", "msh")
 
 
@@ -215,7 +215,7 @@ def test_textures_lie_on_the_faces_that_have_them(tmp_path: Path) -> None:
     assert not source.notes["scanned"].get("texture missing")
 
 
-def test_colours_of_vertices_glb_images_and_mujoco_materials_are_kept(tmp_path: Path) -> None:
+def test_colours_of_vertices_gltf_images_and_mujoco_materials_are_kept(tmp_path: Path) -> None:
     mesh = box(0.04, 0.05, 0.06)
     mesh.visual.vertex_colors = [10, 200, 30, 255]
     (tmp_path / "points").mkdir()
@@ -226,9 +226,16 @@ def test_colours_of_vertices_glb_images_and_mujoco_materials_are_kept(tmp_path: 
     mesh.visual = trimesh.visual.TextureVisuals(uv=np.full((8, 2), 0.5), material=material)
     (tmp_path / "glb").mkdir()
     mesh.export(tmp_path / "glb/glb.glb")
+    (tmp_path / "gltf").mkdir()
+    for file, data in mesh.export(file_type="gltf").items():
+        (tmp_path / "gltf" / file).write_bytes(data)
+    document = json.loads((tmp_path / "gltf/model.gltf").read_text())
+    (tmp_path / "gltf/model.gltf").write_text(json.dumps({**document, "images": [{"uri": "an%20image.png"}]}))
+    image.save(tmp_path / "gltf/an image.png")
     write_as("mjcf", box(0.04, 0.05, 0.06), tmp_path / "red")
     source = open_objects(f"folder:{tmp_path}")
-    for name, rgb in (("points", (10, 200, 30)), ("glb", (200, 10, 10)), ("red", (255, 0, 0))):
+    reds = ("glb", (200, 10, 10)), ("gltf", (200, 10, 10)), ("red", (255, 0, 0))
+    for name, rgb in (("points", (10, 200, 30)), *reds):
         np.testing.assert_array_equal(source.load(name).visual.face_rgb, np.tile(rgb, (12, 1)), err_msg=name)
 
 

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import struct
+import subprocess
+import sys
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
+import trimesh
 
 from datagen.schemas.errors import InputError
 from datagen.workers.objects import decomposition, open_objects, surfaces
@@ -17,6 +25,7 @@ from tests.workers.objects.folder_files import box, cup, write_as
 STL = box(0.04, 0.05, 0.06).export(file_type="stl")
 PLY = box(0.04, 0.05, 0.06).export(file_type="ply", encoding="ascii")
 GLB = box(0.04, 0.05, 0.06).export(file_type="glb")
+GLTF = box(0.04, 0.05, 0.06).export(file_type="gltf")["model.gltf"]
 URDF = '<robot name="a"><link name="l"><visual><geometry>{}</geometry></visual></link>{}</robot>'
 BOX = '<box size="0.04 0.05 0.06"/>'
 BALL = '<geom size="0.03"/>'
@@ -52,6 +61,10 @@ BAD: dict[str, tuple[str, str | bytes, str]] = {
     "ply without faces": ("a.ply", _ply(b"element face 12", b"element face 0"), ""),
     "glb cut off": ("a.glb", GLB[: len(GLB) // 2], ""),
     "glb of another kind": ("a.glb", b"PK\x03\x04" + bytes(100), "zip file"),
+    "gltf cut off": ("a.gltf", GLTF[: len(GLTF) // 2], ""),
+    "gltf of another kind": ("a.gltf", GLB, "binary glTF file"),
+    "gltf without its buffer": ("a.gltf", GLTF, "cannot be read"),
+    "gltf of a buffer outside": ("a.gltf", GLTF.replace(b"gltf_buffer_0", b"../../x"), "not inside"),
     "msh header": ("a.xml", MJCF.format(OF_MESH, '<geom type="mesh" mesh="m"/>'), "a.msh"),
     "flat": ("a.obj", "v 0 0 0\nv .1 0 0\nv .1 .1 0\nv 0 .1 0\nf 1 2 3\nf 1 3 4\n", "no volume"),
     "too small": ("a.stl", box(0.001, 0.001, 0.001).export(file_type="stl"), "wrong size"),
@@ -172,6 +185,31 @@ def test_a_decomposition_that_fails_costs_its_object(
     fault(monkeypatch)
     source = open_objects(f"folder:{tmp_path}")
     assert source.names() == ["box"] and named in source.excluded["cup"]
+
+
+def test_a_decomposition_ends_with_the_program_that_a_signal_ends(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    ball.vertices *= 0.04 + 0.01 * np.sin(9 * ball.vertices).prod(axis=1, keepdims=True)  # for some seconds
+    write_as("stl", ball, tmp_path / "ball")
+    environment = {**os.environ, "DATAGEN_CACHE": str(tmp_path / "cache")}
+    words = [sys.executable, "-m", "datagen.cli", "assets", "check", str(tmp_path / "ball")]
+    with subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL) as process:
+        child = _decomposing(psutil.Process(process.pid))
+        process.terminate()
+    assert process.returncode == -signal.SIGTERM
+    child.wait(5)
+
+
+def _decomposing(parent: psutil.Process) -> psutil.Process:
+    """The child that has loaded CoACD."""
+    until = time.monotonic() + 60
+    while time.monotonic() < until:
+        for child in parent.children():
+            with suppress(psutil.Error):
+                if any("coacd" in file.path for file in child.memory_maps()):
+                    return child
+        time.sleep(0.02)
+    raise AssertionError("nothing was decomposed")
 
 
 @pytest.mark.slow
