@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from datagen.drawing.trial_picture import Retrial
 
 _POINT_M, _BASE_M = 0.005, 0.04
+_SHEER = (255, 255, 255, 40)  # of walls, through which rooms are seen
+_ABOUT = "__properties"  # where Rerun keeps what it says of a recording
 # Of a file of Rerun: bytes before the first message, and kinds of messages.
 _HEADER_BYTES, _END, _STORE = 12, 0, 1
 
@@ -62,7 +64,11 @@ def _chunks(run: Run, rows: SceneRows, scene: ReconstructedScene) -> Iterator[Ch
     record, samples, camera = rows.record, rows.samples, scene.camera
     n, trial = int(record["n_points"]), _best_trial(run, rows, scene)
     yield _static("/", rr.ViewCoordinates, xyz=[rr.components.ViewCoordinates.RIGHT_HAND_Z_UP])
-    yield _mesh("house", concatenate([body.visual for body in scene.house.house.bodies]))
+    yield _static(_ABOUT, rr.archetypes.RecordingInfo, name=[f"scene {scene.index}: {scene.models[0].name}"])
+    bodies = [(body.object_type == "Wall", body.visual) for body in scene.house.house.bodies]
+    yield _mesh("house", concatenate([visual for is_wall, visual in bodies if not is_wall]))
+    if walls := [visual for is_wall, visual in bodies if is_wall]:
+        yield _mesh("walls", concatenate(walls), albedo_factor=[_SHEER])
     for k, (model, T) in enumerate(zip(scene.models, scene.T_world_object, strict=True)):
         yield _mesh(f"objects/{k}", model.visual)
         if trial is None:  # a static pose would hide one over time
@@ -109,12 +115,13 @@ def _moving(run: Run, again: Retrial) -> Iterator[Chunk]:
     yield Chunk.from_columns("joints", [rr.TimeColumn("trial", duration=recording.time_s)], joints)
 
 
-def _mesh(path: str, mesh: Mesh) -> Chunk:
+def _mesh(path: str, mesh: Mesh, **more: Any) -> Chunk:
     """A mesh with a vertex for each corner of its faces, since colours are of faces."""
     corners_m = mesh.vertices_m[mesh.faces].reshape(-1, 3)
     faces = np.arange(len(corners_m), dtype=np.uint32).reshape(-1, 3)
     rgb = np.repeat(mesh.face_rgb, 3, axis=0)
-    return _static(path, rr.Mesh3D, vertex_positions=corners_m, triangle_indices=faces, vertex_colors=rgb)
+    shown = {"vertex_positions": corners_m, "triangle_indices": faces, "vertex_colors": rgb}
+    return _static(path, rr.Mesh3D, **shown, **more)
 
 
 def _pose(path: str, T: F64, time_s: F64 | None = None) -> Chunk:
