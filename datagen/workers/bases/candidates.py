@@ -12,8 +12,8 @@ from datagen.schemas.fields import facing_rad
 from datagen.schemas.specification import CandidateParams, Range
 from datagen.workers.bases.clearance import (
     Footprint,
+    HouseObstacles,
     ObstacleDistances,
-    Surroundings,
     base_clearance_m,
     distances_from_obstacles,
 )
@@ -94,7 +94,7 @@ def footprint_of(params: CandidateParams) -> Footprint | None:
 
 def draw_candidates(
     target_center_m: F64,
-    obstacles: Surroundings,
+    obstacles: HouseObstacles,
     params: CandidateParams,
     rng: np.random.Generator,
     reach: Reach | None = None,
@@ -195,7 +195,7 @@ def _with_clearance(
     yaw_rad: F32,
     robot_index: npt.NDArray[np.int16],
     robots: _SceneRobots,
-    obstacles: Surroundings,
+    obstacles: HouseObstacles,
     params: CandidateParams,
 ) -> SceneCandidates:
     """SceneCandidates of robots at positions (N, 2) and headings (N,), world, with their clearance."""
@@ -215,7 +215,7 @@ class _Rounds:
     def __init__(
         self,
         target_center_m: F64,
-        obstacles: Surroundings,
+        obstacles: HouseObstacles,
         params: CandidateParams,
         rng: np.random.Generator,
         reach: Reach | None,

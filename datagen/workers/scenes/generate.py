@@ -12,7 +12,7 @@ from datagen.schemas.identity import Stream, generator
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import CandidateParams, ObservationParams, SettleParams, Specification
 from datagen.workers.bases.candidates import SceneCandidates, draw_candidates
-from datagen.workers.bases.clearance import Surroundings, base_clearance_m
+from datagen.workers.bases.clearance import HouseObstacles, base_clearance_m
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.geometry.transforms import look_at
@@ -234,7 +234,7 @@ _BLOCK = 4
 def draw_viewpoint(
     rays: RayScene,
     room: Room,
-    obstacles: Surroundings,
+    obstacles: HouseObstacles,
     target_center_m: F64,
     params: ObservationParams,
     robot: CandidateParams,
