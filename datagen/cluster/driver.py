@@ -20,7 +20,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
-from datagen.cluster.protocol import AttemptReport, End, Executor, JobSummary, JobTotals, StopRequest
+from datagen.cluster.protocol import (
+    AttemptOrder,
+    AttemptReport,
+    End,
+    Executor,
+    JobSummary,
+    JobTotals,
+    StopRequest,
+)
 from datagen.cluster.shard_policy import (
     Durations,
     OpenShards,
@@ -41,16 +49,6 @@ from datagen.schemas.shard_ranges import ShardRanges
 T = TypeVar("T")
 # Upper bound of one wait, so that a stop request is handled soon.
 _POLL_S = 0.25
-
-
-@dataclass(frozen=True)
-class AttemptOrder:
-    """The driver's parameters of an attempt."""
-
-    shard: int
-    attempt: str
-    deadline_s: float
-    may_be_done: bool = True  # another attempt may have committed the shard
 
 
 class Recorder(Protocol):

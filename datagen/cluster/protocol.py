@@ -37,40 +37,33 @@ _STORE_S = 15.0  # for which a stopped job waits for a store that fails
 EXIT_CODES = {"failed": 1, "aborted": 2, "interrupted": 130}  # exit codes; 0 for other ends
 
 
-class Task(Protocol):
-    """The interface of tasks for executors and the guard.
+@dataclass(frozen=True)
+class AttemptOrder:
+    """The driver's parameters of an attempt: all that executors and the guard know of a task.
 
     `attempt` is a file name, unique over all drivers of the run. `notes` is the folder, within the machine's
     temporary folder, for the worker's process id and stack, unique to the job; "" for none. An absolute path
     is used as it is.
     """
 
-    @property
-    def shard(self) -> int: ...
-    @property
-    def attempt(self) -> str: ...
-    @property
-    def deadline_s(self) -> float: ...
-    @property
-    def notes(self) -> str: ...
+    shard: int
+    attempt: str
+    deadline_s: float
+    may_be_done: bool = True  # another attempt may have committed the shard
+    notes: str = ""
 
 
-@dataclass(frozen=True)
-class ShardTask:
+@dataclass(frozen=True, kw_only=True)
+class ShardTask(AttemptOrder):
     """One attempt of one shard. Equal tasks give equal arrays on every machine."""
 
     run: str  # folder or URL of the run
     spec: Specification
     layout: Layout
-    shard: int
-    attempt: str
     houses: str  # source reference as on the command line: `builtin`, `procthor:DIR`
     objects: str
-    deadline_s: float
     robot: str = ""  # place of the robot's file; "" for one of the registry
-    notes: str = ""
     scenes_from: str = ""  # folder or URL of the run whose scenes are labelled again; "" for new scenes
-    may_be_done: bool = True  # another attempt may have committed the shard
     probe: str = ""  # a file of the run by which machines recognize it; "" for none
     code_digest: str = field(default_factory=code_digest)  # of the driver's code
 
@@ -188,10 +181,10 @@ class JobSummary:
     and its fix.
     """
 
-    end: End
-    cause: str
-    totals: JobTotals
-    elapsed_s: float
+    end: End = "complete"
+    cause: str = ""
+    totals: JobTotals = field(default_factory=lambda: JobTotals(0))
+    elapsed_s: float = 0.0
     start_s: float = 0.0  # before the driver began
 
     @property
@@ -208,11 +201,6 @@ class JobSummary:
         worst = max(self, later, key=lambda summary: get_args(End).index(summary.end))
         totals = self.totals.plus(later.totals)
         return JobSummary(worst.end, worst.cause, totals, self.elapsed_s + later.elapsed_s)
-
-
-def empty_summary() -> JobSummary:
-    """Summary of a job without work."""
-    return JobSummary("complete", "", JobTotals(0), 0.0)
 
 
 class StopRequest:

@@ -162,7 +162,7 @@ def _write(part: Part, run: Run, tick: Tick) -> WrittenPart:
         if run.commit_of(commit.shard).attempt != commit.attempt:
             start = part.runs[source].ledger.start_of(commit.attempt)
             run.ledger.end(superseded_end(commit, SPARE_CAUSE, start.started if start else ""))
-    run.close_lost_attempts()  # of shards that another source has
+    run.close_lost_attempts("")  # of shards that another source has
     return WrittenPart(run, len(there), len(new), len(part.spare))
 
 
