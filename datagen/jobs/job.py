@@ -193,7 +193,7 @@ class Job:
 
         def make_task(order: AttemptOrder) -> ShardTask:
             return ShardTask(
-                **vars(order) | {"notes": notes},
+                **vars(replace(order, notes=notes)),
                 run=run.storage.url,
                 spec=spec,
                 layout=layout,

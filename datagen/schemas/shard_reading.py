@@ -117,7 +117,7 @@ class ZipFiles:
 
 @dataclass(eq=False)
 class StoreZip(_Zipped):
-    """A store in a zip, as `encode_store` writes it."""
+    """A store in a zip, as `scripts/pack_benchmark.py` writes it."""
 
     files: ZipFiles
 
