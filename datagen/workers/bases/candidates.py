@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -19,25 +19,15 @@ from datagen.workers.bases.clearance import (
 )
 from datagen.workers.geometry.mesh import F32, F64
 
+if TYPE_CHECKING:  # it needs the compiler
+    from datagen.workers.motion.reachable_set import ReachableSet
+
 Bools = npt.NDArray[np.bool_]
 
 # Rounds over all cells, each with new jitter, in which a robot must find its positions.
 ROUNDS = 8
 # Robots sampled per robot that a scene needs, before the scene is rejected.
 DRAWS_A_ROBOT = 16
-
-
-class Reach(Protocol):
-    """Where a hand gets; `ReachableSet` is one."""
-
-    @property
-    def farthest_m(self) -> float:
-        """Horizontal distance from the mount beyond which no position is reached."""
-        ...
-
-    def holds(self, positions_base_m: F64) -> Bools:
-        """Whether the hand gets to positions (N, 3) in the base frame: the mount, x to the front."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +87,7 @@ def draw_candidates(
     obstacles: HouseObstacles,
     params: CandidateParams,
     rng: np.random.Generator,
-    reach: Reach | None = None,
+    reach: ReachableSet | None = None,
 ) -> SceneCandidates | None:
     """Return all cells of the grid, or `per_scene` positions jittered within cells, with their robots.
 
@@ -218,7 +208,7 @@ class _Rounds:
         obstacles: HouseObstacles,
         params: CandidateParams,
         rng: np.random.Generator,
-        reach: Reach | None,
+        reach: ReachableSet | None,
     ) -> None:
         cells = grid_offsets(params)
         self._target_m, self._params = target_center_m, params

@@ -148,12 +148,13 @@ def try_candidate(
     with clock.stage("plan"):
         report = plan_candidate(planning, T_world_base, rng)
     disturbances = disturbances_of(at, index, spec)
+    arrived = [T_world_base @ d.T_base_moved for d in disturbances]
+    fits = fits_at(at, arrived, candidates, row, spec) if arrived else np.empty(0, np.bool_)
     if at.arm.trial is None:
-        return _plan_arrivals(at, T_world_base, report, disturbances, candidates, row, spec, rng)
+        return _plan_arrivals(at, T_world_base, report, disturbances, fits, rng)
     if report.plan is None:
         return CandidateTrial(report.outcome, report)
     if disturbances:
-        fits = fits_at(at, [T_world_base @ d.T_base_moved for d in disturbances], candidates, row, spec)
         return _repeat(at, T_world_base, report, disturbances, fits, rng, record)
     return _attempt(at, T_world_base, report, report.plan, rng, record)
 
@@ -163,27 +164,21 @@ def _plan_arrivals(
     T_world_base: F64,
     report: PlanReport,
     disturbances: list[Disturbance],
-    candidates: SceneCandidates,
-    row: int,
-    spec: Specification,
+    fits: Bools,
     rng: np.random.Generator,
 ) -> CandidateTrial:
     """Plan again from the arrival pose of each disturbance; the label stays that of the candidate.
 
     This includes candidates without a plan: a robot that arrives near one may succeed.
     """
-    if not disturbances:
-        return CandidateTrial(
-            report.outcome, report, report.plan, successes=int(report.plan is not None), trials=1
-        )
-    fits = fits_at(at, [T_world_base @ d.T_base_moved for d in disturbances], candidates, row, spec)
-    successes = 0
+    successes = int(report.plan is not None and not disturbances)
     with at.clock.stage("plan"):
         for disturbance, does_fit in zip(disturbances, fits.tolist(), strict=True):
             if does_fit:
                 found = plan_candidate(at.planning, T_world_base @ disturbance.T_base_moved, rng)
                 successes += found.plan is not None
-    return CandidateTrial(report.outcome, report, report.plan, successes=successes, trials=len(disturbances))
+    trials = len(disturbances) or 1
+    return CandidateTrial(report.outcome, report, report.plan, successes=successes, trials=trials)
 
 
 def _attempt(
