@@ -208,15 +208,13 @@ class StopRequest:
 
     def __init__(self) -> None:
         self._count = 0
-        self._store_until_s = float("inf")
+        self.store_until_s = float(
+            "inf"
+        )  # when to give up an object store that fails, by the monotonic clock
 
     def ask(self) -> None:
         self._count += 1
-        self._store_until_s = time.monotonic() + (_STORE_S if self._count == 1 else 0.0)
-
-    def store_until_s(self) -> float:
-        """When to give up an object store that fails, by the monotonic clock."""
-        return self._store_until_s
+        self.store_until_s = time.monotonic() + (_STORE_S if self._count == 1 else 0.0)
 
     @property
     def drain(self) -> bool:
@@ -247,7 +245,7 @@ def stop_on_signals(stop: StopRequest, interrupt: bool = False) -> Generator[Sto
     numbers = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
     before = {number: signal.signal(number, handle) for number in numbers}
     try:
-        with repeated_until(stop.store_until_s):
+        with repeated_until(lambda: stop.store_until_s):
             yield stop
     except StoreUnavailable as error:
         if stop.drain:

@@ -16,11 +16,9 @@ from datagen.display.progress import steps
 from datagen.evaluation.report_tables import with_interval
 from datagen.schemas.errors import InputError, one_line, printable
 from datagen.schemas.run import open_runs
-from datagen.schemas.specification import HeuristicParams, Specification
+from datagen.schemas.specification import DISTANCES, Distance, HeuristicParams, Specification
 from datagen.train.heuristic_fit import (
     FOLDS,
-    FORMS,
-    Form,
     Trials,
     agreements,
     fit,
@@ -42,7 +40,7 @@ def calibrate(
     *,
     out: Path,
     candidates: Sets = "clear",
-    distance: Literal[Form, "any"] = "planar",
+    distance: Literal[Distance, "any"] = "planar",
     allow_incomplete: AllowIncomplete = False,
     json: AsJson = False,
 ) -> int:
@@ -66,7 +64,7 @@ def calibrate(
     specs = _specifications(runs, candidates)
     trials = _read(runs, candidates, allow_incomplete, all(s.candidates.within == "in-range" for s in specs))
     refuse_too_little(trials, ", ".join(runs))
-    forms: tuple[Form, ...] = FORMS if distance == "any" else (distance,)
+    forms: tuple[Distance, ...] = DISTANCES if distance == "any" else (distance,)
     before = specs[0].heuristic
 
     def refit(some: Trials) -> HeuristicParams:

@@ -73,7 +73,7 @@ def _source(
         "made_from": "; ".join(dict.fromkeys(each.run.manifest.made_from for each in labels)),
         "counts": counts,
         "doubts": [line for each in labels if (line := doubt(each))],
-        "outcomes_within_reach": _summed(each.outcomes() for each in labels),
+        "outcomes_within_reach": dict(sum((Counter(each.outcomes()) for each in labels), Counter())),
         "core_s": cost,
         "total_core_s": total,
         "includes_scenes": scenes_s is not None,
@@ -110,14 +110,6 @@ def _scenes_s(group: Sequence[Labels], runs: Sequence[Run]) -> float | None:
 
 def _plain(account: Account) -> dict[str, Any]:
     return {name: getattr(account, name) for name in ("attempts", "unknown", "wall_s", "core_s")}
-
-
-def _summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    total: dict[str, int] = {}
-    for each in counts:
-        for name, count in each.items():
-            total[name] = total.get(name, 0) + count
-    return total
 
 
 QUARANTINED = "quarantined"

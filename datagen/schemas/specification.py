@@ -299,6 +299,10 @@ class VisibilityParams(Frozen):
     window_px: int = Field(default=64, ge=8, le=512)
 
 
+Distance = Literal["planar", "planar-over-reach", "mount-over-reach"]
+DISTANCES: tuple[Distance, ...] = get_args(Distance)
+
+
 class HeuristicParams(Frozen):
     """The distance-visibility label (paper, Sec. III-B).
 
@@ -306,7 +310,7 @@ class HeuristicParams(Frozen):
     sigma_l and sigma_r. By default mu is the middle of the stated bounds, which are at two sigma.
     """
 
-    distance: Literal["planar", "planar-over-reach", "mount-over-reach"] = "planar"
+    distance: Distance = "planar"
     a: float = Field(default=1.0, gt=0, le=10)
     mu: float = Field(default=0.53, gt=0, le=10)
     sigma_l: float = Field(default=0.195, gt=0, le=10)

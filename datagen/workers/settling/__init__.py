@@ -30,8 +30,8 @@ class SettleResult:
     penetration_m: float
 
 
-# Lets objects fall onto static convex parts (V, 3) each, in a fresh physics scene, deterministically. Parts and
-# start poses (K, 4, 4) are in the world frame.
+# Lets objects fall onto static convex parts (V, 3) each, in a fresh physics scene, deterministically; parts
+# and start poses (K, 4, 4) are in the world frame.
 Settler = Callable[[Sequence[F32], Sequence[ObjectModel], F64, SettleParams], SettleResult]
 
 _CHECK_EVERY = 5  # steps between checks of the speeds: reading them costs as much as a step
