@@ -30,17 +30,8 @@ from datagen.train.tensors import to_torch
 
 # Raise it when the same run would give other tokens or columns.
 _VERSION = 4
-# Fields of a model's configuration that decide its tokens.
-_DECISIVE = (
-    "n_points",
-    "tokens",
-    "near_m",
-    "scales_m",
-    "camera",
-    "observed_visibility",
-    "hand_poses",
-    "kinematics",
-)
+# Fields of a model's configuration that do not decide its tokens.
+_OF_NETWORK = ("width", "embedding", "head", "dropout", "mirrored")
 _TOKENS, _COLUMNS = "tokens.f16", "columns.npz"
 
 
@@ -157,7 +148,7 @@ def encode_runs(
     The stream is unshuffled and has all candidates. `seen(done, of)` is called while scenes
     are encoded.
     """
-    decisive = {name: model.config[name] for name in _DECISIVE if name in model.config}
+    decisive = {name: value for name, value in model.config.items() if name not in _OF_NETWORK}
     samples = [summary.samples_sha256 for summary in stream.parts]
     key = digest_of({"version": _VERSION, "tokens": decisive, "samples": samples})
     place = folder / key
