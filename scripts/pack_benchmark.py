@@ -44,8 +44,8 @@ from datagen.schemas.shard_files import (
 from datagen.schemas.specification import Specification
 from datagen.train.baselines import FIELDS
 from datagen.train.batching import SAMPLE_FIELDS, SCENE_FIELDS
-from datagen.train.reader import JOIN_FIELDS, Columns, load_shard
-from datagen.train.run_parts import RunPart, open_parts
+from datagen.train.reader import Columns, load_shard
+from datagen.train.run_parts import JOIN_FIELDS, RunPart, open_parts
 from datagen.train.scene_table import TABLE_FIELDS
 
 # What methods may use and scoring does not read.

@@ -38,7 +38,6 @@ from datagen.cluster.shard_policy import (
     deadline_s,
     decide,
     ends_early,
-    is_suspect,
     nothing_runs,
     too_many_quarantined,
     window,
@@ -179,7 +178,8 @@ class _Driver(Generic[T]):
         return self._open.next()
 
     def _is_suspect(self, shard: int) -> bool:
-        return shard in self._troubled and is_suspect(self._troubled[shard])
+        """Whether the shard may crash its machine: then no other suspect runs at the same time."""
+        return shard in self._troubled and self._troubled[shard].lost >= 2
 
     def _submit(self, shard: int) -> None:
         trouble = self._troubled.get(shard, ShardFailures())

@@ -87,7 +87,7 @@ def run_training(
         while not at.finished:
             wait_began_s = time.perf_counter()
             for batch in training.train.epoch(at.epoch, at.batch):
-                clock.waited_from(wait_began_s)
+                clock.wait_s += time.perf_counter() - wait_began_s
                 stop = stopping()
                 step = _step(training, batch, clock)
                 for callback in callbacks:
@@ -201,15 +201,12 @@ class _Clock:
     """Wall and CPU seconds of this process since the last lap, and how many it waited for batches."""
 
     def __init__(self) -> None:
-        self._wall_s, self._cpu_s, self._wait_s = time.perf_counter(), time.process_time(), 0.0
-
-    def waited_from(self, began_s: float) -> None:
-        self._wait_s += time.perf_counter() - began_s
+        self._wall_s, self._cpu_s, self.wait_s = time.perf_counter(), time.process_time(), 0.0
 
     def lap(self) -> tuple[float, float, float]:
         """Wall, CPU and waiting seconds since the last lap."""
-        wall_s, cpu_s, wait_s = self._wall_s, self._cpu_s, self._wait_s
-        self._wall_s, self._cpu_s, self._wait_s = time.perf_counter(), time.process_time(), 0.0
+        wall_s, cpu_s, wait_s = self._wall_s, self._cpu_s, self.wait_s
+        self._wall_s, self._cpu_s, self.wait_s = time.perf_counter(), time.process_time(), 0.0
         return self._wall_s - wall_s, self._cpu_s - cpu_s, wait_s
 
 

@@ -37,7 +37,7 @@ class Robot:
 
     def __init__(self, source: RobotSource, reach_m: float | None = None) -> None:
         assembly = assemble(source, reach_m)
-        hand, base = assembly.hand, assembly.base
+        hand, base, chain = assembly.hand, assembly.base, assembly.chain
         self.source = source
         self.name = source.name  # as the registry and the specification name it
         # Largest distance from the shoulder to the TCP.
@@ -48,14 +48,14 @@ class Robot:
         self.base_radius_m = base.radius_m  # None stands on a pedestal
         self.presents = source.keys.base.presents  # how the base stands to the target
         self.gripper = hand.gripper
-        self.T_base_root: F64 = inverse(assembly.T_root_mount)  # (4, 4), pose of the URDF's root link
+        self.T_base_root: F64 = inverse(base.T_root_mount)  # (4, 4), pose of the URDF's root link
         # (3,), base frame: the point that reach_m is measured from; no TCP is ever farther.
         self.shoulder_m: F64 = assembly.shoulder_m
-        self.joint_names = assembly.names  # (A,) of the coordinates, from the base on
-        self.slides = assembly.slides  # (A,)
-        self.q_lower_rad: F64 = assembly.lower  # (A,)
-        self.q_upper_rad: F64 = assembly.upper  # (A,)
-        self.speed_limit_radps: F64 = assembly.speed  # (A,)
+        self.joint_names = chain.coordinates  # (A,) of the coordinates, from the base on
+        self.slides = chain.slides  # (A,)
+        self.q_lower_rad: F64 = chain.lower  # (A,)
+        self.q_upper_rad: F64 = chain.upper  # (A,)
+        self.speed_limit_radps: F64 = chain.speed  # (A,)
         self.drive = source.keys.drive
         self.link_names = tuple(body.name for body in assembly.bodies)  # (L,)
         # (L,) convex parts in link frames, fingers fully open.
@@ -159,14 +159,8 @@ def _mesh_of(body: LinkBody) -> Mesh:
             T = np.diag([body.scale] * 3 + [1.0]) @ shape.T_link_shape @ np.diag([*shape.scale, 1.0])
             meshes.append(_read_visual(shape.mesh).transformed(T))
     except InputError:  # what cannot be read is drawn as its hulls
-        return _meshes(body.parts_m)
-    return concatenate([*meshes, *map(_plain, body.drawn_m)]) if meshes else _meshes(body.drawn_m)
-
-
-def _meshes(parts_m: Parts) -> Mesh:
-    if not parts_m:
-        return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
-    return concatenate(list(map(_plain, parts_m)))
+        return concatenate([*map(_plain, body.parts_m)])
+    return concatenate([*meshes, *map(_plain, body.drawn_m)])
 
 
 def _plain(corners_m: F32) -> Mesh:

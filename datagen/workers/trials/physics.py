@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -234,29 +235,27 @@ class TrialWorld:
 
     def is_supported(self) -> bool:
         """Whether anything but the robot pushed the target in the last step."""
-        target = self._things[0]
-        for contact in self._system.get_contacts():
-            first, second = contact.bodies
-            if first is target or second is target:
-                other = second if first is target else first
-                pushes = other not in self._links and any(point.impulse.any() for point in contact.points)
-                if pushes:
-                    return True
-        return False
+        return any(
+            other not in self._links and any(point.impulse.any() for point in points)
+            for other, _, points in self._on_target()
+        )
 
     def finger_impulses(self) -> F64:
         """Impulses (2, 3) of the fingers on the target in the last step, newton seconds, world frame."""
         impulses = np.zeros((2, 3))
-        target = self._things[0]
-        for contact in self._system.get_contacts():
-            first, second = contact.bodies
-            if first is target or second is target:
-                other, sign = (second, 1.0) if first is target else (first, -1.0)
-                for k, finger in enumerate(self._fingers):
-                    if other is finger:
-                        for point in contact.points:
-                            impulses[k] += np.multiply(sign, point.impulse)
+        for other, sign, points in self._on_target():
+            for k, finger in enumerate(self._fingers):
+                if other is finger:
+                    for point in points:
+                        impulses[k] += np.multiply(sign, point.impulse)
         return impulses
+
+    def _on_target(self) -> Iterator[tuple[Any, float, Any]]:
+        """Each contact of the target: the other body, the sign of impulses on the target, and the points."""
+        for contact in self._system.get_contacts():
+            for k, sign in enumerate((1.0, -1.0)):
+                if contact.bodies[k] is self._things[0]:
+                    yield contact.bodies[1 - k], sign, contact.points
 
 
 def _fresh_system() -> physx.PhysxCpuSystem:
