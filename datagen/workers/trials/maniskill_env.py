@@ -49,7 +49,7 @@ from datagen.workers.trials.physics import (
     tune_pad,
     tune_shape,
 )
-from datagen.workers.trials.trial_scene import TrialScene, disturbed_things, pedestal_below, still_parts_near
+from datagen.workers.trials.trial_scene import TrialScene, disturbed, pedestal_below, still_parts_near
 
 ENV_ID = "DatagenGrasp-v1"
 _MAX_TICKS = 1000
@@ -177,7 +177,7 @@ class DatagenGraspEnv(BaseEnv):
             if pedestal_m is not None:
                 pedestal = still_body([pedestal_m], PEDESTAL, friction)
                 self._build(pedestal, "static", env, np.eye(4), "pedestal")
-            things = disturbed_things(prepared, task.disturbance)
+            things = disturbed(prepared, task.disturbance)
             rows = zip(things.parts_m, things.mass_kg, things.T_world_object, strict=True)
             for k, (parts, mass, T) in enumerate(rows):
                 body = thing_body(parts, float(mass), friction)
@@ -193,7 +193,7 @@ class DatagenGraspEnv(BaseEnv):
         return _BodyBuilder(body, kind, env, T_world_body, self.scene).build(name=f"{name}-{env}")
 
     def _root_poses(self) -> Pose:
-        T = [t.T_world_true_base @ t.prepared.articulation.T_base_root for t in self.tasks]
+        T = [t.T_world_true_base @ self.robot.T_base_root for t in self.tasks]
         return _poses(T, self.device)
 
     # -- episodes -----------------------------------------------------------------------------------
