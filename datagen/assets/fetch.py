@@ -120,7 +120,7 @@ def fetch(
 def _install(asset: CatalogueEntry, kept: Path, folder: Path) -> int:
     """Copy or unpack the download; return the number of its files."""
     home = folder / PurePosixPath(asset.into)
-    if asset.archive:
+    if asset.file.endswith((".zip", ".tgz")):
         return unpack(kept, home)
     with kept.open("rb") as source, whole_file(home / asset.file, alone=True) as file:
         shutil.copyfileobj(source, file)

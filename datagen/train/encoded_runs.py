@@ -23,7 +23,7 @@ import torch
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
 from datagen.train.dataset import SampleStream
-from datagen.train.inputs import I64, Array, Batch, Bools, RobotInputs
+from datagen.train.inputs import I64, Array, Batch, RobotInputs
 from datagen.train.models.shared import SharedModel
 from datagen.train.models.tokens import EncodedCandidates, EncodedClouds, pack, packed_width, token_sizes
 from datagen.train.tensors import to_torch
@@ -58,16 +58,6 @@ class EncodedRuns:
         """Bounds (R + 1,) of each robot's candidates."""
         robots = len(self.columns["scene_of_robot"])
         return np.searchsorted(self.columns["robot_of_candidate"], np.arange(robots + 1))
-
-    @cached_property
-    def scene_of_candidate(self) -> I64:
-        """Scene (N,) of each candidate."""
-        return self.columns["scene_of_robot"][self.columns["robot_of_candidate"]]
-
-    @property
-    def label(self) -> Array:
-        """Labels (N,), 0 or 1."""
-        return self.columns["label"]
 
     def batch(self, scenes: I64) -> Batch[Array]:
         """A batch of these scenes, in their order."""
@@ -117,19 +107,6 @@ class EncodedBatches:
             order = np.random.default_rng([self._seed, k]).permutation(order)
         for some in np.array_split(order, self.batches_per_epoch)[skip_batches:]:
             yield self._encoded.batch(some)
-
-    @property
-    def n_samples(self) -> int:
-        """Candidates of one epoch."""
-        return int(self._chosen().sum())
-
-    def class_counts(self) -> tuple[int, int]:
-        """(negatives, positives) of one epoch."""
-        positives = int(self._encoded.label[self._chosen()].sum())
-        return self.n_samples - positives, positives
-
-    def _chosen(self) -> Bools:
-        return np.isin(self._encoded.scene_of_candidate, self._scenes)
 
 
 def _ranges(bounds: I64, rows: I64) -> tuple[I64, I64]:

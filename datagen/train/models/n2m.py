@@ -111,17 +111,13 @@ class N2mModel(Model):
         valid = crop.valid[:, None, :, None]
         hidden = self.points(features) * valid
         mean = hidden.sum(2) / valid.sum(2).clamp(min=1)
-        rise, radius = crop.target_rise_m, _radius_m(crop)
+        distance = torch.linalg.vector_norm(target_frame_points(crop), dim=2)
+        radius = distance.masked_fill(~crop.target_mask, 0.0).amax(1)  # of the target around its centre
+        rise = crop.target_rise_m
         of_robot = torch.stack([reach_m, rise, rise / reach_m, 10 * radius], dim=1)
         of_robot = of_robot[:, None].expand(-1, views.shape[1], -1)
         known = self.head(torch.cat([hidden.amax(2), mean, of_robot], dim=2))
         return self.mixture(known).unflatten(2, (self.sizes.components, _PER_COMPONENT)).float()
-
-
-def _radius_m(crop: Crop) -> Tensor:
-    """Distance (R,) of the farthest point of the target from its centre."""
-    distance = torch.linalg.vector_norm(target_frame_points(crop), dim=2)
-    return distance.masked_fill(~crop.target_mask, 0.0).amax(1)
 
 
 def _principal_axes(points_m: Tensor, valid: Tensor) -> Tensor:

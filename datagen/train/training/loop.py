@@ -124,7 +124,8 @@ def _repeatable(device: torch.device) -> Generator[None]:
 def _step(training: Training, batch: Batch[Array], clock: _Clock) -> TrainingStep:
     """Take a step on a batch. InputError at a loss or gradient that is not finite."""
     options, at, device = training.options, training.position, training.model.device
-    torch.manual_seed(_seed(options.seed, at.epoch, at.batch, 0))
+    seed = np.random.SeedSequence([_STEP_STREAM, options.seed, at.epoch, at.batch, 0])
+    torch.manual_seed(int(seed.generate_state(1, np.uint64)[0]))
     given = to_torch(batch, device)
     with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
         logits = training.model(given.clouds, given.candidates, given.robots)
@@ -186,10 +187,6 @@ def _refuse(quantity: str, at: Position, batch: Batch[Array], bad: Tensor) -> No
         f"is not finite for {len(ids)} samples: {named}",
         "Nothing was overwritten. Check them with `datagen verify`, or give a smaller --lr and a new --out",
     )
-
-
-def _seed(*numbers: int) -> int:
-    return int(np.random.SeedSequence([_STEP_STREAM, *numbers]).generate_state(1, np.uint64)[0])
 
 
 def _add_cost(at: Position, wall_s: float, cpu_s: float, wait_s: float) -> None:

@@ -27,7 +27,6 @@ from datagen.workers.robots.robot import Robot
 from datagen.workers.settling.sapien_physics import sapien_pose
 from datagen.workers.trials import Disturbance
 from datagen.workers.trials.drive_targets import (
-    ControlPeriod,
     drive_targets,
     planned_rise_m,
     pressing_target_m,
@@ -112,7 +111,7 @@ class DatagenGraspEnv(BaseEnv):
         ):
             fix = "Make one environment for each robot and set of parameters"
             raise InputError(ENV_ID, "tasks", "differ in robot or parameters", fix)
-        self.scripts = [_script(task) for task in self.tasks]
+        self.scripts = [drive_targets(t.plan, self.robot, self.params) for t in self.tasks]
         self.rises_m = [planned_rise_m(task.plan, self.robot) for task in self.tasks]
         kwargs = {"sim_backend": "physx_cpu", "render_backend": "none", "reconfiguration_freq": 1} | kwargs
         super().__init__(
@@ -194,7 +193,8 @@ class DatagenGraspEnv(BaseEnv):
 
     def _root_poses(self) -> Pose:
         T = [t.T_world_true_base @ self.robot.T_base_root for t in self.tasks]
-        return _poses(T, self.device)
+        rows = [np.concatenate([p.p, p.q]) for p in map(sapien_pose, T)]
+        return Pose.create(torch.tensor(np.stack(rows), dtype=torch.float32, device=self.device))
 
     # -- episodes -----------------------------------------------------------------------------------
 
@@ -301,12 +301,3 @@ def execute_plans(env: DatagenGraspEnv) -> torch.Tensor:
         info = env.step(env.plan_action())[4]
         success = torch.where(ends == step + 1, info["success"], success)
     return success
-
-
-def _script(task: GraspTask) -> list[ControlPeriod]:
-    return drive_targets(task.plan, task.prepared.robot, task.prepared.params)
-
-
-def _poses(T: Sequence[F64], device: torch.device) -> Pose:
-    rows = [np.concatenate([p.p, p.q]) for p in map(sapien_pose, T)]
-    return Pose.create(torch.tensor(np.stack(rows), dtype=torch.float32, device=device))
