@@ -153,7 +153,7 @@ def _zip(files: dict[str, bytes]) -> bytes:
 
 def _asset(**changes: object) -> CatalogueEntry:
     values: dict[str, object] = {"name": "toy", "file": "toy.zip", "url": "http://127.0.0.1:9/toy.zip"}
-    values |= {"licence": "CC0-1.0", "into": "toy", "about": "a toy", "archive": True}
+    values |= {"licence": "CC0-1.0", "into": "toy", "about": "a toy"}
     return CatalogueEntry(**(values | changes))  # type: ignore[arg-type]
 
 
