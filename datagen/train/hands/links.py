@@ -33,16 +33,12 @@ def obstacles(clouds: Clouds[Array]) -> list[DistanceGrid]:
     ]
 
 
+# Of N bases as in `reach_codes`: rows of their poses, positions (N, 2), turns and rises.
+Bases = tuple[I64, F64, F64, F64]
+
+
 def room_codes(
-    arm: PoseReach,
-    links: ArmLinks,
-    around: Sequence[DistanceGrid],
-    axes: F64,
-    reach: U8,
-    pose_row: I64,
-    base_xy_m: F64,
-    turn_rad: F64,
-    rise_m: F64,
+    arm: PoseReach, links: ArmLinks, around: Sequence[DistanceGrid], axes: F64, reach: U8, bases: Bases
 ) -> U8:
     """Codes (N, K, N_ROOMS) of K poses from each of N bases: 1 to 255 for -8 to 8 cm, 0 where unknown.
 
@@ -52,25 +48,17 @@ def room_codes(
     found = np.zeros((*reach.shape[:2], N_ROOMS), np.uint8)
     able = reach.min(axis=2) > 0
     able &= np.cumsum(able, axis=1) <= _POSES
-    for start in range(0, len(pose_row), _AT_ONCE):
+    for start in range(0, len(reach), _AT_ONCE):
         n, k = np.nonzero(able[start : start + _AT_ONCE])
         n += start
-        hands = np.moveaxis(axes[pose_row[n], k], 0, 2)  # (3 of TCP, approach and closing axis, 3, Q)
-        given = (pose_row[n], base_xy_m[n], turn_rad[n], rise_m[n])
-        found[n, k] = _rooms(arm, links, around, hands, *given)
+        pose_row, base_xy_m, turn_rad, rise_m = (each[n] for each in bases)
+        hands = np.moveaxis(axes[pose_row, k], 0, 2)  # (3 of TCP, approach and closing axis, 3, Q)
+        found[n, k] = _rooms(arm, links, around, hands, (pose_row, base_xy_m, turn_rad, rise_m))
     return found
 
 
-def _rooms(
-    arm: PoseReach,
-    links: ArmLinks,
-    around: Sequence[DistanceGrid],
-    hands: F64,
-    cloud: I64,
-    base_xy_m: F64,
-    turn_rad: F64,
-    rise_m: F64,
-) -> U8:
+def _rooms(arm: PoseReach, links: ArmLinks, around: Sequence[DistanceGrid], hands: F64, bases: Bases) -> U8:
+    cloud, base_xy_m, turn_rad, rise_m = bases
     yaw = np.arctan2(-base_xy_m[:, 1], -base_xy_m[:, 0]) + turn_rad
     mount = np.stack([*base_xy_m.T, -rise_m])
     tcp, a, b = to_front(yaw, hands[0] - mount), to_front(yaw, hands[1]), to_front(yaw, hands[2])

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from datagen.train.hands.links import N_ROOMS, obstacles, room_codes
+from datagen.train.hands.links import N_ROOMS, Bases, obstacles, room_codes
 from datagen.train.hands.poses import N_MEASURES
 from datagen.train.hands.sizes import HandSize, hand_size
-from datagen.train.inputs import F32, F64, I64, U8, Array, CandidateInputs, Clouds, RobotInputs
+from datagen.train.inputs import F32, U8, Array, CandidateInputs, Clouds, RobotInputs
 from datagen.workers.motion.arm_links import arm_links
 from datagen.workers.motion.pose_reach import N_STAGES, pose_reach, reach_codes
 
@@ -51,13 +51,13 @@ def hand_reach(
     arms = [(str(n), round(float(r), 2)) for n, r in zip(names_of(robots), robots.arm_reach_m, strict=True)]
     for arm in dict.fromkeys(arms):
         some = np.flatnonzero(np.array([each == arm for each in arms])[row])
-        where: tuple[I64, F64, F64, F64] = (
+        where: Bases = (
             robots.cloud_row[row[some]].astype(np.int64),
             candidates.base_xy_m[some].astype(np.float64),
             turn_rad[some].astype(np.float64),
             rise_m[row[some]].astype(np.float64),
         )
         reach = reach_codes(pose_reach(*arm), axes, *where)
-        rooms = room_codes(pose_reach(*arm), arm_links(arm[0]), around, axes, reach, *where)
+        rooms = room_codes(pose_reach(*arm), arm_links(arm[0]), around, axes, reach, where)
         found[some] = np.concatenate([reach, rooms], axis=2)
     return found

@@ -71,7 +71,7 @@ class Training:
 def run_training(
     training: Training,
     save: Callable[[], None],
-    callbacks: Sequence[TrainingCallback] = (),
+    callbacks: Sequence[TrainingProgress] = (),
     stopping: Callable[[], bool] = lambda: False,
     save_every_s: float = 300.0,
 ) -> bool:
@@ -272,16 +272,6 @@ class TrainingStep:
     step_s: float  # for the whole step
 
 
-class TrainingCallback(Protocol):
-    """Called after each step and each epoch."""
-
-    def step(self, step: TrainingStep) -> None: ...
-
-    def epoch(self, record: dict[str, Any]) -> None:
-        """A row of the history: epoch, loss, val_loss, val_accuracy, val_balanced_accuracy, val_auc, best."""
-        ...
-
-
 class TrainingProgress:
     """Progress of the training to `place`: loss, speed, time left, the loader's share; a row per epoch."""
 
@@ -291,12 +281,14 @@ class TrainingProgress:
         self._pace = Pace(lambda: self._spent_s)
 
     def step(self, step: TrainingStep) -> None:
+        """Called after each step."""
         self._spent_s, self._steps = self._spent_s + step.step_s, self._steps + 1
         self._samples, self._waited_s = self._samples + step.samples, self._waited_s + step.wait_s
         self._pace.see(self._samples, self._waited_s, self._steps)
         self._shown.update("steps", step.step, step.steps, lambda: self._figures(step))
 
     def epoch(self, record: dict[str, Any]) -> None:
+        """Called after each epoch with its row of the history, and whether it is the `best`."""
         numbers = "".join(
             f"  {name} {record[field]:.4f}"
             for name, field in (("balanced", "val_balanced_accuracy"), ("AUC", "val_auc"))

@@ -45,7 +45,7 @@ def rooms(
     arm = pose_reach(name, reach_m)
     reach = reach_codes(arm, axes, *given)
     around = obstacles(cloud_of(points_m, target_points)) * 200
-    return reach[:, 0], room_codes(arm, arm_links(name), around, axes, reach, *given)[:, 0]
+    return reach[:, 0], room_codes(arm, arm_links(name), around, axes, reach, given)[:, 0]
 
 
 @pytest.mark.parametrize(("name", "reach_m"), ROBOTS)
