@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.train.hands.links import N_ROOMS, obstacles, room_codes
+from datagen.train.hands.reach import N_ROOMS, obstacles, room_codes
 from datagen.train.inputs import F64, U8, Clouds
 from datagen.workers.motion.arm_links import arm_links
 from datagen.workers.motion.pose_reach import pose_reach, reach_codes
