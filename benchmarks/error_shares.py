@@ -92,7 +92,8 @@ def main() -> None:
     rows["a quarter of the scenes"] = trained(data, (), seeds, given.epochs, share=0.25)
     rows["no hand poses"] = trained(data, (), seeds, given.epochs, hand_poses=0)
     test = data["test"].estimated
-    show(rows, test.label == 1, test.scene_of_candidate)
+    scene = test.columns["scene_of_robot"][test.columns["robot_of_candidate"]]
+    show(rows, test.columns["label"] == 1, scene)
 
 
 def inputs_of(path: str, houses: str, objects: str, scenes: int | None, out: Path) -> Inputs:
@@ -117,7 +118,7 @@ def first_scenes(encoded: EncodedRuns, count: int) -> EncodedRuns:
     kept = {
         len(encoded.houses): count,
         len(encoded.columns["scene_of_robot"]): robots,
-        len(encoded.label): int(encoded.candidate_bounds[robots]),
+        len(encoded.columns["label"]): int(encoded.candidate_bounds[robots]),
     }
     columns = {name: values[: kept[len(values)]] for name, values in encoded.columns.items()}
     return EncodedRuns(encoded.key, encoded.tokens[:robots], columns)

@@ -34,7 +34,7 @@ from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
 from datagen.train.prediction.pictures import draw_prediction
 from datagen.train.scorers import Scorer
-from datagen.workers.bases.clearance import STEP_M, obstacles_of
+from datagen.workers.bases.clearance import STEP_M, HouseObstacles
 from datagen.workers.geometry.planar import inside_polygon, signed_distances_to_convex
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.houses.house import House
@@ -162,7 +162,7 @@ def _settings(house: House, robot: RobotSize) -> Iterator[tuple[str, KnownFloor 
 
 def house_map(house: House, low_m: float, high_m: float) -> OccupancyMap:
     """The map of a house: occupied where something stands between two heights, free elsewhere in rooms."""
-    obstacles = obstacles_of(house)
+    obstacles = HouseObstacles(house).near(np.zeros((1, 2)), np.inf, np.inf)
     corners = np.concatenate(obstacles.floors_m)
     low, high = corners.min(axis=0) - 0.5, corners.max(axis=0) + 0.5
     size = np.ceil((high - low) / _RESOLUTION_M).astype(int)

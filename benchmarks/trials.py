@@ -30,11 +30,8 @@ from datagen.workers.labels.arm_labelling import arm_of, draw_disturbances
 from datagen.workers.trials import Disturbance, TrialResult, execute, physics
 from datagen.workers.trials.execute import run_trial
 from datagen.workers.trials.trial_scene import (
-    MovableObjects,
     TrialScene,
-    pedestal_below,
     prepare_trials,
-    still_parts_near,
 )
 
 
@@ -187,16 +184,7 @@ def build_time_s(cases: list[Case], prepared: list[TrialScene], trial: TrialPara
     """Mean CPU seconds until the first step of a trial."""
     started_s = time.process_time()
     for case, scene in zip(cases, prepared, strict=True):
-        physics.TrialWorld(
-            still_parts_near(scene, case.T_world_base),
-            pedestal_below(scene, case.T_world_base),
-            MovableObjects(scene.parts_m, scene.mass_kg, scene.T_world_object),
-            scene.robot,
-            scene.articulation,
-            case.T_world_base,
-            trial.object_friction,
-            trial,
-        )
+        physics.TrialWorld(scene, case.T_world_base, 0.0, trial.object_friction)
     return (time.process_time() - started_s) / len(cases)
 
 

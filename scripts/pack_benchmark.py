@@ -9,8 +9,9 @@ Zarr reader open a pack. Equal runs give equal bytes.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,17 +28,29 @@ from datagen.evaluation.benchmark import (
 )
 from datagen.evaluation.columns import EXTRA
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import RecordSchema, sized_schema
+from datagen.schemas.fields import TABLES, RecordSchema, sized_schema
+from datagen.schemas.run_records import Layout, SealedPart
 from datagen.schemas.safe_files import whole_file
-from datagen.schemas.sealing import ZIPPED, encode_store
+from datagen.schemas.sealing import ZIPPED, consolidated
+from datagen.schemas.shard_files import (
+    cf_attributes,
+    described,
+    encode_array,
+    root_attributes,
+    rows_per_shard,
+    zarr_metadata,
+    zipped,
+)
+from datagen.schemas.specification import Specification
 from datagen.train.baselines import FIELDS
 from datagen.train.batching import SAMPLE_FIELDS, SCENE_FIELDS
-from datagen.train.reader import JOIN_FIELDS, Columns, load_shard
-from datagen.train.run_parts import RunPart, open_parts
+from datagen.train.reader import Columns, load_shard
+from datagen.train.run_parts import JOIN_FIELDS, RunPart, open_parts
 from datagen.train.scene_table import TABLE_FIELDS
 
 # What methods may use and scoring does not read.
 _SHOWN = ("T_world_camera", "intrinsics_px", "image_size_px", "object_name", "candidate_index")
+_ZSTD_LEVEL = 22  # small rather than fast
 _PACKED = {*SCENE_FIELDS, *SAMPLE_FIELDS, *TABLE_FIELDS, *EXTRA, *FIELDS, *_SHOWN}
 
 
@@ -95,6 +108,33 @@ def _first_scenes(path: str, scenes: int) -> tuple[RunPart, RecordSchema, Column
         if not scenes:
             break
     return part, schema, {name: np.concatenate([each[name] for each in taken]) for name in taken[0]}
+
+
+def encode_store(
+    schema: RecordSchema, spec: Specification, sources: Mapping[str, str], arrays: Columns
+) -> bytes:
+    """Return the zip of the run's first scenes, all with the same number of candidates.
+
+    It is a store as sealed ones, without files of many chunks. Equal rows give equal bytes.
+
+    `arrays` has the rows of each field of `schema`; `sources` are those of the run's manifest.
+    """
+    scenes, samples = len(arrays["scene_index"]), len(arrays["sample_scene_index"])
+    layout = Layout(scenes_per_shard=scenes, candidates_per_scene=samples // scenes)
+    spec_hash = spec.hash()
+    part = SealedPart(spec_hash=spec_hash, scenes_per_shard=scenes, n=samples, samples=samples, missing=())
+    parts = [{**part.model_dump(mode="json"), "specification": spec.document()}]
+    attributes = described([spec], [sources], [samples]) | root_attributes(schema, layout, spec_hash)
+    rows = {table: rows_per_shard(layout, table) for table in TABLES}
+    of_arrays = {field.name: cf_attributes(field, table) for table, field in schema.fields}
+    metadata = zarr_metadata(schema, layout, rows, attributes | {"parts": parts}, of_arrays)
+    files = {
+        path: json.dumps(json.loads(data), separators=(",", ":")).encode()
+        for path, data in consolidated(metadata).items()
+    }
+    for table, field in schema.fields:
+        files |= encode_array(schema, layout, table, field, arrays[field.name], _ZSTD_LEVEL)
+    return zipped(files)
 
 
 def main(words: Sequence[str] | None = None) -> int:

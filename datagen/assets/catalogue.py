@@ -36,7 +36,6 @@ class CatalogueEntry:
     about: str
     sha256: str | None = None
     size: int | None = None
-    archive: bool = False
     title: str = ""  # with `attribution` and `licence`, what the folder `holds` states of itself
     attribution: str = ""
     holds: str = ""  # subfolder of the target; "" for `into`
@@ -84,7 +83,6 @@ _ALL = (
         attribution=_CALLI,
         holds="mani_skill2_ycb",
         sha256="1551724fd1ac7bad9807ebcf46dd4a788caed5c9499c1225b9bfa080ffbefcb3",
-        archive=True,
     ),
     _houses("train", "ee3c4aa14b4d8f0895fecfb5fdaca59395427ca1018b2f9aeeedbc61e5824587", 53_314_510),
     _houses("val", "d808540514e26b6726cd2790490e669b572eeb94febb5188a2f403591dd21721", 5_094_681),
@@ -107,7 +105,6 @@ _ALL = (
         title="AI2-THOR scenes",
         attribution=_KOLVE,
         holds="ai2thor",
-        archive=True,
     ),
     *(
         CatalogueEntry(
@@ -119,7 +116,6 @@ _ALL = (
             about="YCB laser scan (16k triangles), without convex parts",
             title="YCB objects",
             attribution=_CALLI,
-            archive=True,
         )
         for key in _SCANNED
     ),

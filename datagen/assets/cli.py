@@ -23,7 +23,7 @@ app = App(name="assets", help="List, fetch, check and split houses and objects."
 def list_assets(*, json: AsJson = False) -> int:
     """List the assets that can be fetched."""
     if json:
-        assets = [{k: v for k, v in asdict(asset).items() if k != "archive"} for asset in CATALOGUE.values()]
+        assets = [asdict(asset) for asset in CATALOGUE.values()]
         print_json({"assets": assets})
         return 0
     scans = [name for name in CATALOGUE if name.startswith("ycb-scans/")]

@@ -12,10 +12,10 @@ import numpy.typing as npt
 
 from datagen.cluster.attempt_guard import Meter, this_host
 from datagen.cluster.protocol import (
+    AttemptOrder,
     AttemptResult,
     JobCannotContinue,
     ShardTask,
-    Task,
     UnfitMachine,
     code_digest,
 )
@@ -55,7 +55,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
 
 def commit_rows(
     run: Run,
-    task: Task,
+    task: AttemptOrder,
     data: bytes,
     labels: npt.NDArray[Any],
     clock: StageClock,

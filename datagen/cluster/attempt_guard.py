@@ -32,7 +32,13 @@ from typing import TypeVar
 
 import psutil
 
-from datagen.cluster.protocol import AttemptReport, AttemptResult, JobCannotContinue, Task, UnfitMachine
+from datagen.cluster.protocol import (
+    AttemptOrder,
+    AttemptReport,
+    AttemptResult,
+    JobCannotContinue,
+    UnfitMachine,
+)
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.run_records import STAGES, Cost, Host, Outcome, StageClock
 from datagen.schemas.safe_files import is_private, whole_file
@@ -44,7 +50,7 @@ from datagen.schemas.storage.errors import (
     repeated_for_minutes,
 )
 
-T = TypeVar("T", bound=Task)
+T = TypeVar("T", bound=AttemptOrder)
 
 # Characters of a stack that a ledger entry keeps, from its end, where the failing frame is.
 STACK_LIMIT = 16_000
@@ -81,7 +87,8 @@ def guarded(function: Callable[[T, Meter], AttemptResult], task: T, deadline: bo
     meter = Meter()
     begun = AttemptReport(task.attempt, task.shard, "failed", started=utc_now(), host=this_host())
     try:
-        with _notes(task, begun.started, deadline), _progress(task, meter), repeated_for_minutes():
+        beats = beating(beat_path(task.notes, task.attempt)) if task.notes else nullcontext()
+        with _notes(task, begun.started, deadline), beats as meter.watch, repeated_for_minutes():
             try:
                 product = function(task, meter)
             except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
@@ -118,7 +125,7 @@ def _failure(begun: AttemptReport, meter: Meter, error: Exception) -> AttemptRep
 
 
 @contextmanager
-def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
+def _notes(task: AttemptOrder, started: str, deadline: bool) -> Generator[None]:
     if not task.notes:
         yield
         return
@@ -149,14 +156,6 @@ def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
         faulthandler.enable(sys.__stderr__)
     note.unlink(missing_ok=True)
     stack.unlink(missing_ok=True)
-
-
-@contextmanager
-def _progress(task: Task, meter: Meter) -> Generator[None]:
-    with (
-        beating(beat_path(_folder(task.notes), task.attempt)) if task.notes else nullcontext() as meter.watch
-    ):
-        yield
 
 
 @cache
@@ -247,12 +246,14 @@ def collect_post_mortem(notes: str, attempt: str) -> Note:
             note = replace(note, stack=file.read(STACK_LIMIT).decode(errors="replace"))
     except FileNotFoundError:
         pass
-    for file in (path, note_path(notes, attempt), beat_path(_folder(notes), attempt)):
+    for file in (path, note_path(notes, attempt), beat_path(notes, attempt)):
         file.unlink(missing_ok=True)
     return note
 
 
-def failure_report(task: Task, outcome: Outcome, cause: str, left: Note | None = None) -> AttemptReport:
+def failure_report(
+    task: AttemptOrder, outcome: Outcome, cause: str, left: Note | None = None
+) -> AttemptReport:
     """The report of an attempt whose worker died, from its files on this machine, or from `left`.
 
     A cause of many lines is cut to one; where the worker left no stack, its whole text is the stack.
@@ -284,11 +285,6 @@ def failure_report(task: Task, outcome: Outcome, cause: str, left: Note | None =
     )
 
 
-def running_attempts(notes: str) -> Running:
-    """The progress of the attempts of a job that run on this machine."""
-    return running_here(_folder(notes)) if notes else Running()
-
-
 def _folder(notes: str) -> Path:
     return Path(tempfile.gettempdir(), notes)  # an absolute path is used as it is
 
@@ -317,9 +313,9 @@ class Running:
     in_grasps: int = 0  # attempts that compute grasps, each of one object
 
 
-def beat_path(folder: Path, attempt: str) -> Path:
+def beat_path(notes: str, attempt: str) -> Path:
     """The file of an attempt's progress."""
-    return folder / f"{attempt}{_SUFFIX}"
+    return _folder(notes) / f"{attempt}{_SUFFIX}"
 
 
 @contextmanager
@@ -344,10 +340,10 @@ def beating(path: Path) -> Generator[Watch]:
             path.unlink(missing_ok=True)
 
 
-def running_here(folder: Path) -> Running:
-    """The progress of the attempts whose files are in the folder."""
+def running_attempts(notes: str) -> Running:
+    """The progress of the attempts of a job that run on this machine."""
     labels = in_grasps = 0
-    for path in folder.glob(f"*{_SUFFIX}"):
+    for path in _folder(notes).glob(f"*{_SUFFIX}") if notes else ():
         with suppress(OSError, struct.error):  # it has ended meanwhile, or has not begun a stage
             stage, made = _BEAT.unpack(path.read_bytes())
             labels += made

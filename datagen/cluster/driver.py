@@ -20,7 +20,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
-from datagen.cluster.protocol import AttemptReport, End, Executor, JobSummary, JobTotals, StopRequest
+from datagen.cluster.protocol import (
+    AttemptOrder,
+    AttemptReport,
+    End,
+    Executor,
+    JobSummary,
+    JobTotals,
+    StopRequest,
+)
 from datagen.cluster.shard_policy import (
     Durations,
     OpenShards,
@@ -30,7 +38,6 @@ from datagen.cluster.shard_policy import (
     deadline_s,
     decide,
     ends_early,
-    is_suspect,
     nothing_runs,
     too_many_quarantined,
     window,
@@ -41,16 +48,6 @@ from datagen.schemas.shard_ranges import ShardRanges
 T = TypeVar("T")
 # Upper bound of one wait, so that a stop request is handled soon.
 _POLL_S = 0.25
-
-
-@dataclass(frozen=True)
-class AttemptOrder:
-    """The driver's parameters of an attempt."""
-
-    shard: int
-    attempt: str
-    deadline_s: float
-    may_be_done: bool = True  # another attempt may have committed the shard
 
 
 class Recorder(Protocol):
@@ -181,7 +178,8 @@ class _Driver(Generic[T]):
         return self._open.next()
 
     def _is_suspect(self, shard: int) -> bool:
-        return shard in self._troubled and is_suspect(self._troubled[shard])
+        """Whether the shard may crash its machine: then no other suspect runs at the same time."""
+        return shard in self._troubled and self._troubled[shard].lost >= 2
 
     def _submit(self, shard: int) -> None:
         trouble = self._troubled.get(shard, ShardFailures())

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from datagen.cluster.attempt_guard import Meter, guarded
-from datagen.cluster.protocol import AttemptReport, AttemptResult, Task
+from datagen.cluster.protocol import AttemptOrder, AttemptReport, AttemptResult
 from datagen.schemas.record_files import utc_now
 
-T = TypeVar("T", bound=Task)
+T = TypeVar("T", bound=AttemptOrder)
 
 
 class InProcessExecutor(Generic[T]):
@@ -50,5 +50,5 @@ class InProcessExecutor(Generic[T]):
             self._cancelled.append(_cancelled(task))
 
 
-def _cancelled(task: Task) -> AttemptReport:
+def _cancelled(task: AttemptOrder) -> AttemptReport:
     return AttemptReport(task.attempt, task.shard, "cancelled", cause="the job was stopped", ended=utc_now())

@@ -37,40 +37,33 @@ _STORE_S = 15.0  # for which a stopped job waits for a store that fails
 EXIT_CODES = {"failed": 1, "aborted": 2, "interrupted": 130}  # exit codes; 0 for other ends
 
 
-class Task(Protocol):
-    """The interface of tasks for executors and the guard.
+@dataclass(frozen=True)
+class AttemptOrder:
+    """The driver's parameters of an attempt: all that executors and the guard know of a task.
 
     `attempt` is a file name, unique over all drivers of the run. `notes` is the folder, within the machine's
     temporary folder, for the worker's process id and stack, unique to the job; "" for none. An absolute path
     is used as it is.
     """
 
-    @property
-    def shard(self) -> int: ...
-    @property
-    def attempt(self) -> str: ...
-    @property
-    def deadline_s(self) -> float: ...
-    @property
-    def notes(self) -> str: ...
+    shard: int
+    attempt: str
+    deadline_s: float
+    may_be_done: bool = True  # another attempt may have committed the shard
+    notes: str = ""
 
 
-@dataclass(frozen=True)
-class ShardTask:
+@dataclass(frozen=True, kw_only=True)
+class ShardTask(AttemptOrder):
     """One attempt of one shard. Equal tasks give equal arrays on every machine."""
 
     run: str  # folder or URL of the run
     spec: Specification
     layout: Layout
-    shard: int
-    attempt: str
     houses: str  # source reference as on the command line: `builtin`, `procthor:DIR`
     objects: str
-    deadline_s: float
     robot: str = ""  # place of the robot's file; "" for one of the registry
-    notes: str = ""
     scenes_from: str = ""  # folder or URL of the run whose scenes are labelled again; "" for new scenes
-    may_be_done: bool = True  # another attempt may have committed the shard
     probe: str = ""  # a file of the run by which machines recognize it; "" for none
     code_digest: str = field(default_factory=code_digest)  # of the driver's code
 
@@ -188,10 +181,10 @@ class JobSummary:
     and its fix.
     """
 
-    end: End
-    cause: str
-    totals: JobTotals
-    elapsed_s: float
+    end: End = "complete"
+    cause: str = ""
+    totals: JobTotals = field(default_factory=lambda: JobTotals(0))
+    elapsed_s: float = 0.0
     start_s: float = 0.0  # before the driver began
 
     @property
@@ -210,25 +203,18 @@ class JobSummary:
         return JobSummary(worst.end, worst.cause, totals, self.elapsed_s + later.elapsed_s)
 
 
-def empty_summary() -> JobSummary:
-    """Summary of a job without work."""
-    return JobSummary("complete", "", JobTotals(0), 0.0)
-
-
 class StopRequest:
     """Counts stop requests. Safe to use in a signal handler."""
 
     def __init__(self) -> None:
         self._count = 0
-        self._store_until_s = float("inf")
+        self.store_until_s = float(
+            "inf"
+        )  # when to give up an object store that fails, by the monotonic clock
 
     def ask(self) -> None:
         self._count += 1
-        self._store_until_s = time.monotonic() + (_STORE_S if self._count == 1 else 0.0)
-
-    def store_until_s(self) -> float:
-        """When to give up an object store that fails, by the monotonic clock."""
-        return self._store_until_s
+        self.store_until_s = time.monotonic() + (_STORE_S if self._count == 1 else 0.0)
 
     @property
     def drain(self) -> bool:
@@ -259,7 +245,7 @@ def stop_on_signals(stop: StopRequest, interrupt: bool = False) -> Generator[Sto
     numbers = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
     before = {number: signal.signal(number, handle) for number in numbers}
     try:
-        with repeated_until(stop.store_until_s):
+        with repeated_until(lambda: stop.store_until_s):
             yield stop
     except StoreUnavailable as error:
         if stop.drain:

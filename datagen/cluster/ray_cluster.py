@@ -61,7 +61,6 @@ class RaySettings:
     address: str = "local"  # or `auto`, `HOST:PORT` of a running cluster
     workers: int | None = None  # slots of a local cluster; None: one per core
     attempts_per_worker: int = 200  # then a new process, because of memory leaks
-    object_store_bytes: int = OBJECT_STORE_BYTES
     task_memory_bytes: int = 0  # that an attempt requests of a running cluster
     # Gets lines about machines of a running cluster: those that are left out, and none being free.
     tell: Callable[[str], None] = lambda line: None
@@ -82,7 +81,7 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
             options: dict[str, Any] = {
                 "num_cpus": settings.workers,
                 "include_dashboard": False,
-                "object_store_memory": settings.object_store_bytes,
+                "object_store_memory": OBJECT_STORE_BYTES,
             }
         else:
             address = _resolved(settings.address)

@@ -21,7 +21,7 @@ from datagen.cluster.attempt_guard import (
     failure_report,
     guarded,
 )
-from datagen.cluster.protocol import AttemptReport, AttemptResult, Task
+from datagen.cluster.protocol import AttemptOrder, AttemptReport, AttemptResult
 from datagen.cluster.ray_cluster import RaySettings, first_line, ray_cluster
 from datagen.cluster.ray_nodes import OtherNodes, attempts_begun, end_attempts, perform, post_mortems_of
 from datagen.schemas.errors import InputError
@@ -36,7 +36,7 @@ _BEGUN_WITHIN_S, _POST_MORTEM_WITHIN_S, _FORGOTTEN_WITHIN_S = 10.0, 15.0, 5.0
 # A wait costs time for every attempt in flight, so it is for a share of them.
 _SHARE_AWAITED = 32
 
-T = TypeVar("T", bound=Task)
+T = TypeVar("T", bound=AttemptOrder)
 
 
 @dataclass(frozen=True)

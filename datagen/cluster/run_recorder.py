@@ -43,14 +43,3 @@ class RunRecorder:
 
     def missing(self) -> ShardRanges:
         return self._run.missing()
-
-
-def close_lost_attempts(run: Run) -> int:
-    """Write end records for attempts of killed drivers; return their number.
-
-    Call it when a job has ended. The worker of a killed driver may outlive it and still commit, so an
-    attempt is closed, as lost with unknown cost, only once its shard is decided without it. If the driver is
-    still running, its own record replaces this one. Attempts of open shards stay open for the job that
-    resumes.
-    """
-    return run.close_lost_attempts(utc_now())

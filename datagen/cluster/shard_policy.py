@@ -112,11 +112,6 @@ def decide(
     return Decision("retry", now, wait_s)
 
 
-def is_suspect(trouble: ShardFailures) -> bool:
-    """Whether the shard may crash its machine: then no other suspect runs at the same time."""
-    return trouble.lost >= 2
-
-
 def at_once(lost_in_a_row: int, width: int) -> int:
     """How many of `width` attempts to have in flight.
 

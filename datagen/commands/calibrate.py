@@ -16,18 +16,17 @@ from datagen.display.progress import steps
 from datagen.evaluation.report_tables import with_interval
 from datagen.schemas.errors import InputError, one_line, printable
 from datagen.schemas.run import open_runs
-from datagen.schemas.specification import HeuristicParams, Specification
+from datagen.schemas.specification import DISTANCES, Distance, HeuristicParams, Specification
 from datagen.train.heuristic_fit import (
     FOLDS,
-    FORMS,
-    Form,
     Trials,
     agreements,
     fit,
     fit_leaving_houses_out,
     refuse_too_little,
 )
-from datagen.train.reader import SampleReader
+from datagen.train.reader import read_shards
+from datagen.train.run_parts import JOIN_FIELDS, open_parts
 from datagen.workers.bases.candidate_sets import CANDIDATE_SETS, in_set
 
 Sets = Literal["grid", "clear", "in-range"]
@@ -42,7 +41,7 @@ def calibrate(
     *,
     out: Path,
     candidates: Sets = "clear",
-    distance: Literal[Form, "any"] = "planar",
+    distance: Literal[Distance, "any"] = "planar",
     allow_incomplete: AllowIncomplete = False,
     json: AsJson = False,
 ) -> int:
@@ -66,7 +65,7 @@ def calibrate(
     specs = _specifications(runs, candidates)
     trials = _read(runs, candidates, allow_incomplete, all(s.candidates.within == "in-range" for s in specs))
     refuse_too_little(trials, ", ".join(runs))
-    forms: tuple[Form, ...] = FORMS if distance == "any" else (distance,)
+    forms: tuple[Distance, ...] = DISTANCES if distance == "any" else (distance,)
     before = specs[0].heuristic
 
     def refit(some: Trials) -> HeuristicParams:
@@ -162,14 +161,14 @@ def _specifications(paths: Sequence[str], candidates: Sets) -> list[Specificatio
 
 def _read(paths: Sequence[str], candidates: Sets, allow_incomplete: bool, all_reached: bool) -> Trials:
     """The labels of all runs over the chosen set of candidates; `all_reached`: all are within reach."""
-    reader = SampleReader(paths, ("house_id",), (*_INPUTS, "base_is_clear", "label"), allow_incomplete)
+    fields = ("house_id", *_INPUTS, "base_is_clear", "label")
     parts: list[dict[str, Any]] = []
     n_scenes = 0
-    for columns in reader.shards():
+    for columns in read_shards(open_parts(paths, (*fields, *JOIN_FIELDS), allow_incomplete)):
         columns["scene_row"] = columns["scene_row"] + n_scenes
         n_scenes += len(columns["house_id"])
         parts.append(columns)
-    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in ("scene_row", *fields)}
     trials = Trials(
         scene=joined["scene_row"],
         house=joined["house_id"],

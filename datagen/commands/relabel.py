@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 from datagen.console.command_lines import resumable
 from datagen.console.options import AsJson, RunPath
@@ -14,6 +13,7 @@ from datagen.jobs.job_report import print_job
 from datagen.jobs.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
+from datagen.schemas.specification import Distance
 from datagen.schemas.storage import open_storage
 
 
@@ -30,7 +30,7 @@ def relabel(
     a: float | None = None,
     alpha: float | None = None,
     tau: float | None = None,
-    distance: Literal["planar", "planar-over-reach", "mount-over-reach"] | None = None,
+    distance: Distance | None = None,
     config: Path | None = None,
     json: AsJson = False,
 ) -> int:

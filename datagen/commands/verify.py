@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
+from datagen.console.command_lines import command_line
 from datagen.console.options import AsJson, AssetSources, RunPath, Sources, Whole
 from datagen.console.printing import counted, listed, print_json, print_lines, print_rows, seconds, size
 from datagen.display.progress import counting
@@ -187,7 +187,8 @@ def _print(report: dict[str, Any], checked: Checked, found: _Found, repaired: Re
         rows.append(("restored", counted(len(repaired.restored), "record")))
         rows.append(("set aside", listed(sorted(repaired.set_aside)) or "nothing"))
         if repaired.set_aside:
-            rows.append(("", f"now in {repaired.into}; to make shards again: {_resume(report['run'])}"))
+            again = command_line(["resume", report["run"]])
+            rows.append(("", f"now in {repaired.into}; to make shards again: {again}"))
     if (replay := report["replay"]) is not None:
         done = f"{counted(replay['asked'], 'scene')} made again and compared bit for bit"
         rows.append(("replay", done if replay["done"] else "not done: repair the run first"))
@@ -196,10 +197,6 @@ def _print(report: dict[str, Any], checked: Checked, found: _Found, repaired: Re
     state = "clean" if not found.damage else counted(found.damage, "finding")
     print_rows(f"{state}: {report['run']}", rows)
     _print_findings(found.kept, found.counts.total())
-
-
-def _resume(run: str) -> str:
-    return f"datagen resume {shlex.quote(run)}"
 
 
 def _print_findings(findings: list[Finding], total: int) -> None:

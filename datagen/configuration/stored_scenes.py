@@ -30,10 +30,6 @@ class StoredScenes:
     objects: str
     robot: str = ""  # place of the robot's file; "" for one of the registry
 
-    @property
-    def candidates_per_scene(self) -> int:
-        return self.run.layout.candidates_per_scene
-
     def available(self) -> int:
         """Number of candidates in the scenes before the first missing shard."""
         committed = self.run.committed()
@@ -112,7 +108,8 @@ def specify_again(
 
 def layout_again(spec: Specification, stored: StoredScenes, n: int) -> Layout:
     """The layout of a new run of n labels, in shards that the stored scenes fill."""
-    per_scene, available = stored.candidates_per_scene, stored.available() // stored.candidates_per_scene
+    per_scene = stored.run.layout.candidates_per_scene
+    available = stored.available() // per_scene
     wanted = -(-n // per_scene)
     most = layout_of(spec, n).scenes_per_shard
     fitting = next((k for k in range(most, 0, -1) if -(-wanted // k) * k <= available), 1)

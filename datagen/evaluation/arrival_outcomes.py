@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import signal
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -196,14 +196,9 @@ def make_arrivals(task: SceneTask, stopping: Stopping) -> bool:
             offset = (arrived.x_m, arrived.y_m, arrived.yaw_rad)
             outcomes[arrived.key] = try_arrival(at, candidates, arrived.candidate, offset, in_world, spec)
     finally:
-        write_outcomes(task.path, outcomes)
+        with whole_file(task.path) as file:
+            file.write(json.dumps({"outcomes": dict(sorted(outcomes.items()))}, indent=0).encode())
     return True
-
-
-def write_outcomes(path: Path, outcomes: Mapping[str, str]) -> None:
-    """Write the file of a scene, in the order of its keys."""
-    with whole_file(path) as file:
-        file.write(json.dumps({"outcomes": dict(sorted(outcomes.items()))}, indent=0).encode())
 
 
 @lru_cache(maxsize=1)

@@ -26,8 +26,8 @@ from datagen.schemas.safe_files import read_regular
 from datagen.schemas.sealing import ZIPPED
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
-from datagen.train.reader import JOIN_FIELDS, Columns, SampleReader
-from datagen.train.run_parts import open_parts
+from datagen.train.reader import Columns, read_shards
+from datagen.train.run_parts import JOIN_FIELDS, open_parts
 
 DEFINITION = "benchmark.json"
 SHIPPED = Path(str(files("datagen.evaluation") / DEFINITION))
@@ -153,7 +153,7 @@ def _has(folder: str, file: str) -> bool:
 
 def digests_of(path: str | Path) -> RunDigests:
     """The digests of a complete run or of its sealed store; copies have the same digests."""
-    return digests_over(SampleReader([path], (), _FIELDS).shards())
+    return digests_over(read_shards(open_parts([path], (*JOIN_FIELDS, *_FIELDS))))
 
 
 def digests_over(shards: Iterable[Columns]) -> RunDigests:

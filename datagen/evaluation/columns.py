@@ -97,7 +97,13 @@ def gather(
                 started_s = time.perf_counter()
                 part[f"score {name}"] = scored(scorer, batch)
                 seconds[name] += time.perf_counter() - started_s
-            _refuse_twice(batch, part["scene"] - n_scenes, known)
+            _, first = np.unique(part["scene"], return_index=True)
+            for sample in (batch.sample_id[row].tobytes() for row in first):
+                if sample in known:
+                    raise InputError(
+                        "RUN", "sample_id", f"{sample.hex()} occurs twice", "Name every run once"
+                    )
+                known.add(sample)
             parts.append(part | _scenes(batch, run, cells))
             n_scenes, n_robots = n_scenes + len(batch.clouds), n_robots + len(batch.robots)
             seen(len(batch.clouds))
@@ -129,11 +135,3 @@ def _scenes(batch: Batch[Array], run: int, cells: int) -> dict[str, Array]:
         "run": np.full(n, run, np.int64),
         "is_grid": (robots == 1) & (candidates == cells) & (cells > 0),
     }
-
-
-def _refuse_twice(batch: Batch[Array], scene_row: Array, known: set[bytes]) -> None:
-    _, first = np.unique(scene_row, return_index=True)
-    for name in (batch.sample_id[row].tobytes() for row in first):
-        if name in known:
-            raise InputError("RUN", "sample_id", f"{name.hex()} occurs twice", "Name every run once")
-        known.add(name)

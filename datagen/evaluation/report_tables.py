@@ -98,7 +98,9 @@ def _reach(report: Report, scores: Report) -> Table:
             with_interval(scores["methods"][record["name"]]["accuracy_in_reach"]),
             with_interval(scores["methods"][record["name"]]["accuracy_out_of_reach"]),
             percent(paper_accuracy(record, report)) if record["regime"] else "-",
-            percent(report["paper"]["accuracy_out_of_reach"]) if _is_two_stage_of_paper(record) else "-",
+            percent(report["paper"]["accuracy_out_of_reach"])
+            if record["regime"] == "two-stage" and _is_of_paper(record)
+            else "-",
         )
         for record in models_first(report["methods"])
     ]
@@ -296,10 +298,6 @@ def paper_accuracy(record: Report, report: Report) -> float | None:
 
 def _is_of_paper(record: Report) -> bool:
     return record["checkpoint"] is not None and record["checkpoint"]["model"] == "paper"
-
-
-def _is_two_stage_of_paper(record: Report) -> bool:
-    return record["regime"] == "two-stage" and _is_of_paper(record)
 
 
 def models_first(records: Sequence[Report]) -> list[Report]:

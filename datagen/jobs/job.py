@@ -16,21 +16,21 @@ from rich.console import Console
 
 from datagen.cluster.attempt import probe_in, run_attempt
 from datagen.cluster.attempt_guard import notes_of_a_job
-from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.driver import drive
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.job_monitor import JobMonitor, JobRecorder
 from datagen.cluster.protocol import (
+    AttemptOrder,
     Executor,
     JobSummary,
     JobTotals,
     ShardTask,
     StopRequest,
-    empty_summary,
     stop_on_signals,
 )
 from datagen.cluster.ray_cluster import RaySettings, refuse_unusable
 from datagen.cluster.ray_executor import ray_executor
-from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.run_recorder import RunRecorder
 from datagen.cluster.shard_policy import RetryPolicy, too_many_quarantined
 from datagen.console.command_lines import Interrupted, command_line, resumable
 from datagen.console.options import JSON_HELP, RUNNING, Whole, option
@@ -130,8 +130,8 @@ class Job:
         missing = self.missing()
         if not any(missing):
             for job_run in self.runs:
-                close_lost_attempts(job_run.run)
-            return self._finish(self._judged(empty_summary()))
+                job_run.run.close_lost_attempts()
+            return self._finish(self._judged(JobSummary()))
         recorder = self.record(missing)
         try:
             summary = self._judged(self.make_missing(recorder, missing))
@@ -160,7 +160,7 @@ class Job:
 
     def make_missing(self, recorder: JobRecorder, missing: Sequence[ShardRanges]) -> JobSummary:
         """Drive one run after the other on one set of workers; return the summary."""
-        stop, whole = StopRequest(), empty_summary()
+        stop, whole = StopRequest(), JobSummary()
         with ExitStack() as stack:
             notes = stack.enter_context(notes_of_a_job())
             shown = stack.enter_context(self.options.display())
@@ -175,7 +175,7 @@ class Job:
             whole = replace(whole, start_s=time.monotonic() - self.began_s - whole.elapsed_s)
         for job_run in self.runs:
             # Attempts of killed drivers are closed last: their workers may still commit.
-            close_lost_attempts(job_run.run)
+            job_run.run.close_lost_attempts()
         return whole
 
     def _drive(
@@ -193,17 +193,13 @@ class Job:
 
         def make_task(order: AttemptOrder) -> ShardTask:
             return ShardTask(
+                **vars(replace(order, notes=notes)),
                 run=run.storage.url,
                 spec=spec,
                 layout=layout,
-                shard=order.shard,
-                attempt=order.attempt,
                 houses=job_run.houses,
                 objects=job_run.objects,
                 robot=job_run.robot,
-                deadline_s=order.deadline_s,
-                may_be_done=order.may_be_done,
-                notes=notes,
                 scenes_from=job_run.scenes_from,
                 probe=probe,
             )

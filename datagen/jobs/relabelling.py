@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,11 @@ import numpy as np
 
 from datagen.cluster.attempt import commit_rows, ends_job
 from datagen.cluster.attempt_guard import Meter
-from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.driver import drive
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.job_monitor import JobProgress
-from datagen.cluster.protocol import AttemptResult, JobSummary, StopRequest, stop_on_signals
-from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.protocol import AttemptOrder, AttemptResult, JobSummary, StopRequest, stop_on_signals
+from datagen.cluster.run_recorder import RunRecorder
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.configuration.specify import manifest_of
 from datagen.configuration.stored_scenes import StoredScenes, specify_again
@@ -117,11 +116,8 @@ def _relabel_shards(
 ) -> JobSummary:
     """Relabel the shards of one run in this process."""
 
-    def work(task: RelabelTask, meter: Meter) -> AttemptResult:
+    def work(task: AttemptOrder, meter: Meter) -> AttemptResult:
         return relabel_shard(run, source, task, meter)
-
-    def make_task(order: AttemptOrder) -> RelabelTask:
-        return RelabelTask(order.shard, order.attempt, order.deadline_s)
 
     done, per_shard = len(run.planned()) - len(run.missing()), run.layout.samples_per_shard
     shown.phase("relabelling")
@@ -130,22 +126,12 @@ def _relabel_shards(
         InProcessExecutor(work),
         JobProgress(shown, per_shard, done),
     )
-    summary = drive(missing, make_task, executor, recorder, RetryPolicy(), events, stop)
-    close_lost_attempts(run)
+    summary = drive(missing, lambda order: order, executor, recorder, RetryPolicy(), events, stop)
+    run.close_lost_attempts()
     return summary
 
 
-@dataclass(frozen=True)
-class RelabelTask:
-    """Relabels one shard in this process."""
-
-    shard: int
-    attempt: str
-    deadline_s: float
-    notes: str = ""
-
-
-def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter) -> AttemptResult:
+def relabel_shard(run: Run, source: Run, task: AttemptOrder, meter: Meter) -> AttemptResult:
     """Label a committed shard of `source` by the rule of `run`, and commit it there.
 
     Labels, scores and ids are new, all other arrays are the source's. Raises InputError for a damaged file,

@@ -73,7 +73,7 @@ def _source(
         "made_from": "; ".join(dict.fromkeys(each.run.manifest.made_from for each in labels)),
         "counts": counts,
         "doubts": [line for each in labels if (line := doubt(each))],
-        "outcomes_within_reach": _summed(each.outcomes() for each in labels),
+        "outcomes_within_reach": dict(sum((Counter(each.outcomes()) for each in labels), Counter())),
         "core_s": cost,
         "total_core_s": total,
         "includes_scenes": scenes_s is not None,
@@ -110,14 +110,6 @@ def _scenes_s(group: Sequence[Labels], runs: Sequence[Run]) -> float | None:
 
 def _plain(account: Account) -> dict[str, Any]:
     return {name: getattr(account, name) for name in ("attempts", "unknown", "wall_s", "core_s")}
-
-
-def _summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    total: dict[str, int] = {}
-    for each in counts:
-        for name, count in each.items():
-            total[name] = total.get(name, 0) + count
-    return total
 
 
 QUARANTINED = "quarantined"
@@ -228,7 +220,7 @@ def print_audit(report: Mapping[str, Any], full: bool = False) -> None:
         )
     sources: Sequence[Source] = report["sources"]
     title = "; ".join(dict.fromkeys(source["made_from"] for source in sources))
-    rows = [row for row in (*_made(sources), *cost_rows(sources)) if full or row[0] in _ALWAYS]
+    rows = [row for row in (*_made(sources), *_cost(sources), *_waste(sources)) if full or row[0] in _ALWAYS]
     print_rows(title, rows, ("", *(source["label_source"] for source in sources)))
     notes = [
         f"{source['label_source']}: add the run that made its scenes, whose cost is missing here"
@@ -236,14 +228,13 @@ def print_audit(report: Mapping[str, Any], full: bool = False) -> None:
         if not source["includes_scenes"]
     ]
     notes += [line for source in sources for line in source["doubts"]]
-    notes += [f"{cause} ({_attempts(account)})" for cause, account in _costliest(sources)]
+    causes = [item for source in sources for item in source["causes"].items()]
+    notes += [
+        f"{cause} ({counted(account['attempts'], 'attempt')}, {seconds(account['core_s'])})"
+        for cause, account in sorted(causes, key=lambda item: -item[1]["core_s"])[:2]
+    ]
     notes += [_agreement(pair) for pair in report["agreement"] if pair["candidates"]]
     print_lines("\n".join(notes))
-
-
-def cost_rows(sources: Sequence[Source]) -> list[tuple[str, ...]]:
-    """Rows of a name and a cell for each label source: cost and waste."""
-    return [*_cost(sources), *_waste(sources)]
 
 
 def _row(name: str, sources: Sequence[Source], cell: Callable[[Source], str]) -> tuple[str, ...]:
@@ -269,9 +260,12 @@ def _made(sources: Sequence[Source]) -> list[tuple[str, ...]]:
 def _cost(sources: Sequence[Source]) -> list[tuple[str, ...]]:
     """Core time by stage, which adds up to the total, and that of a label."""
     stages = list(dict.fromkeys(name for s in sources for name in s["core_s"] if name not in _ADDED))
-    largest = sorted(stages, key=lambda name: -max(_part(s, name) for s in sources))[
-        : _STAGES_SHOWN[min(len(sources), 3) - 1]
-    ]
+
+    def share(name: str) -> float:
+        return max(s["core_s"].get(name, 0.0) / (s["total_core_s"] or 1.0) for s in sources)
+
+    shown = _STAGES_SHOWN[min(len(sources), 3) - 1]
+    largest = sorted(stages, key=share, reverse=True)[:shown]
     small = [name for name in stages if name not in largest]
 
     def cell(*names: str) -> Callable[[Source], str]:
@@ -293,10 +287,6 @@ def _cost(sources: Sequence[Source]) -> list[tuple[str, ...]]:
     for unit, name in _UNITS.items():
         rows.append(_row(name, sources, lambda source, unit=unit: _short(source["core_s_per"][unit])))
     return rows
-
-
-def _part(source: Source, name: str) -> float:
-    return source["core_s"].get(name, 0.0) / (source["total_core_s"] or 1.0)
 
 
 def _short(value_s: float | None) -> str:
@@ -329,15 +319,6 @@ def _waste(sources: Sequence[Source]) -> list[tuple[str, ...]]:
 def _commonest(source: Source) -> str:
     found = sorted(source["rejected_scenes"].items(), key=lambda item: -item[1])[:2]
     return ", ".join(f"{cause} {count:,}" for cause, count in found) or "-"
-
-
-def _costliest(sources: Sequence[Source]) -> list[tuple[str, Mapping[str, Any]]]:
-    causes = [item for source in sources for item in source["causes"].items()]
-    return sorted(causes, key=lambda item: -item[1]["core_s"])[:2]
-
-
-def _attempts(account: Mapping[str, Any]) -> str:
-    return f"{counted(account['attempts'], 'attempt')}, {seconds(account['core_s'])}"
 
 
 def _agreement(pair: Mapping[str, Any]) -> str:

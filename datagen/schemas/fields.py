@@ -112,10 +112,6 @@ class RecordSchema:
         scene, sample = (tuple(f for f in self.table(table) if f.since <= version) for table in TABLES)
         return replace(self, version=version, scene_fields=scene, sample_fields=sample)
 
-    def sized(self, **sizes: int) -> RecordSchema:
-        """The schema with axis lengths of one specification (points, objects)."""
-        return replace(self, sizes={**self.sizes, **sizes})
-
     def check(self, table: Table, rows: int, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Raise InputError for a batch with missing or unknown fields, or a wrong dtype, shape or range."""
         fields = {f.name: f for f in self.table(table)}
@@ -282,12 +278,11 @@ def sized_schema(name: str, spec: Specification, version: int = SCHEMA_VERSION) 
     """Return the named schema with the specification's axis lengths. InputError for an unknown name."""
     if name not in SCHEMAS:
         raise InputError("specification", "label_source", f"no record schema {name!r}", choices(SCHEMAS))
-    joints = {} if spec.arm is None or spec.arm.joints is None else {"joint": spec.arm.joints}
-    return (
-        SCHEMAS[name]
-        .of_version(version)
-        .sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter, **joints)
-    )
+    sizes = {"point": spec.observation.n_points, "object": 1 + spec.scene.n_clutter}
+    if spec.arm is not None and spec.arm.joints is not None:
+        sizes["joint"] = spec.arm.joints
+    schema = SCHEMAS[name].of_version(version)
+    return replace(schema, sizes={**schema.sizes, **sizes})
 
 
 def facing_rad(towards_m: npt.NDArray[Any]) -> npt.NDArray[np.float64]:

@@ -46,11 +46,6 @@ def commit_key(shard: int) -> str:
     return f"commits/{shard:06d}.json"
 
 
-def part_folder(spec_hash: str, scenes_per_shard: int) -> str:
-    """Folder of the part with this specification and these shards in merged runs."""
-    return f"parts/{spec_hash[:16]}-{scenes_per_shard}"
-
-
 def utc_now() -> str:
     """The present time in UTC, ISO 8601 with milliseconds."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")

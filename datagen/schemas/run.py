@@ -277,14 +277,19 @@ class Run:
             problem = f"has {len(data)} bytes with another sha256 than the commit"
         raise InputError(f"{self.storage.url}/{key}", "", problem, REPAIR)
 
-    def close_lost_attempts(self, ended: str = "") -> int:
-        """End attempts without an end, as lost, whose shard is decided without them; return their number."""
+    def close_lost_attempts(self, ended: str | None = None) -> int:
+        """End attempts of killed drivers, as lost with unknown cost, `ended` [now]; return their number.
+
+        Call it when a job has ended. The worker of a killed driver may outlive it and still commit, so only
+        attempts whose shard is decided without them are ended. If the driver is still running, its own
+        record replaces this one. Attempts of open shards stay open for the job that resumes.
+        """
         self.refuse_replaced()
         committed = {commit.attempt: commit.shard for commit in self.brief_commits()}
         decided = set(committed.values()) | self.quarantined()
         lost = [start for start in self.ledger.unfinished(committed) if start.shard in decided]
         for start in lost:
-            self.ledger.end(lost_end(start, ended))
+            self.ledger.end(lost_end(start, utc_now() if ended is None else ended))
         return len(lost)
 
     # Quarantine.

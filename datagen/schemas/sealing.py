@@ -3,14 +3,10 @@
 The store is written once, shard by shard, with the shards' own chunks in a few large files (Zarr's sharding
 codec). It has a new name, and counts from the moment that `data.json` names it; then the one before it is
 removed.
-
-Some scenes of a run are encoded as one small file: such a store, without files of many chunks, in a zip,
-which Zarr's ZipStore opens and `open_sealed` reads without its run. Equal rows give equal bytes.
 """
 
 from __future__ import annotations
 
-import json
 import re
 import secrets
 import warnings
@@ -33,18 +29,14 @@ from datagen.schemas.run_records import Commit, FileEntry, Layout, SealedPart, S
 from datagen.schemas.shard_files import (
     cf_attributes,
     described,
-    encode_array,
     encode_chunk,
     fill_value,
     root_attributes,
-    rows_per_shard,
     with_crc32c,
     zarr_metadata,
-    zipped,
 )
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.shard_reading import committed_place
-from datagen.schemas.specification import Specification
 from datagen.schemas.storage import Storage
 from datagen.schemas.stored_arrays import Array, StoredArray, arrays_of, parse_metadata
 
@@ -321,30 +313,4 @@ class ArrayFiles:
         return path, data
 
 
-ZIPPED = ".zarr.zip"
-_ZSTD_LEVEL = 22  # small rather than fast
-
-
-def encode_store(
-    schema: RecordSchema, spec: Specification, sources: Mapping[str, str], arrays: Mapping[str, Array]
-) -> bytes:
-    """Return the zip of the run's first scenes, all with the same number of candidates.
-
-    `arrays` has the rows of each field of `schema`; `sources` are those of the run's manifest.
-    """
-    scenes, samples = len(arrays["scene_index"]), len(arrays["sample_scene_index"])
-    layout = Layout(scenes_per_shard=scenes, candidates_per_scene=samples // scenes)
-    spec_hash = spec.hash()
-    part = SealedPart(spec_hash=spec_hash, scenes_per_shard=scenes, n=samples, samples=samples, missing=())
-    parts = [{**part.model_dump(mode="json"), "specification": spec.document()}]
-    attributes = described([spec], [sources], [samples]) | root_attributes(schema, layout, spec_hash)
-    rows = {table: rows_per_shard(layout, table) for table in TABLES}
-    of_arrays = {field.name: cf_attributes(field, table) for table, field in schema.fields}
-    metadata = zarr_metadata(schema, layout, rows, attributes | {"parts": parts}, of_arrays)
-    files = {
-        path: json.dumps(json.loads(data), separators=(",", ":")).encode()
-        for path, data in consolidated(metadata).items()
-    }
-    for table, field in schema.fields:
-        files |= encode_array(schema, layout, table, field, arrays[field.name], _ZSTD_LEVEL)
-    return zipped(files)
+ZIPPED = ".zarr.zip"  # a store of some scenes of a run, as `scripts/pack_benchmark.py` writes it

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -50,42 +50,23 @@ class Source(Protocol):
     def chunks(self, wanted: Wanted) -> Iterator[tuple[str, bytes]]: ...
 
 
-class _Zipped(Protocol):
-    """A source whose files are in one zip."""
+@dataclass(eq=False)
+class ZipSource:
+    """A source whose files are in one zip, which `open` reads."""
 
-    @property
-    def url(self) -> str: ...
-
-    def _open(self) -> ZipFiles: ...
+    url: str
+    open: Callable[[], ZipFiles]
 
     def metadata(self, names: Sequence[str]) -> dict[str, StoredArray]:
-        files, paths = self._open(), {name: f"{name}/zarr.json" for name in names}
+        files, paths = self.open(), {name: f"{name}/zarr.json" for name in names}
         return {
             name: parse_metadata(f"{self.url}/{path}", name, files.get(path)) for name, path in paths.items()
         }
 
     def chunks(self, wanted: Wanted) -> Iterator[tuple[str, bytes]]:
-        files = self._open()
+        files = self.open()
         for path in (array.path(index) for array, index in wanted):
             yield f"{self.url}/{path}", files.get(path)
-
-
-@dataclass(eq=False)
-class ShardObject(_Zipped):
-    """The committed object of one shard. Its sha256 is checked when it is first read."""
-
-    run: Run
-    commit: Commit
-    is_checked: bool = False
-
-    @property
-    def url(self) -> str:
-        return f"{self.run.storage.url}/shards/{self.commit.object.path}"
-
-    def _open(self) -> ZipFiles:
-        data = self.run.read_object(self.commit, check=not self.is_checked)
-        self.is_checked = True
-        return ZipFiles(self.url, data)
 
 
 # OverflowError: an offset that no file has.
@@ -113,20 +94,6 @@ class ZipFiles:
             raise InputError(f"{self.place}/{path}", "", "no such file", DAMAGE_FIX) from e
         except _DAMAGED as e:
             raise InputError(f"{self.place}/{path}", "", f"is damaged ({e})", DAMAGE_FIX) from e
-
-
-@dataclass(eq=False)
-class StoreZip(_Zipped):
-    """A store in a zip, as `encode_store` writes it."""
-
-    files: ZipFiles
-
-    @property
-    def url(self) -> str:
-        return self.files.place
-
-    def _open(self) -> ZipFiles:
-        return self.files
 
 
 @dataclass(eq=False)
@@ -255,11 +222,27 @@ class ShardPlace:
         return whole[first - start : past - start]
 
 
+@dataclass(eq=False)
+class _ObjectFiles:
+    """Reads the object of a committed shard. Its sha256 is checked the first time."""
+
+    run: Run
+    commit: Commit
+    url: str
+    is_checked: bool = False
+
+    def __call__(self) -> ZipFiles:
+        data = self.run.read_object(self.commit, check=not self.is_checked)
+        self.is_checked = True
+        return ZipFiles(self.url, data)
+
+
 def committed_place(run: Run, commit: Commit, rows: Rows | None = None) -> ShardPlace:
     """The wanted rows [all] of a committed shard."""
-    source = ShardObject(run, commit)
+    url = f"{run.storage.url}/shards/{commit.object.path}"
     wall_s = commit.cost.all_s["wall"] / max(commit.samples, 1)
     rows = Rows(0, commit.scenes, commit.samples) if rows is None else rows
+    source = ZipSource(url, _ObjectFiles(run, commit, url))
     return ShardPlace(source, 0, rows, commit.scenes, commit.samples, wall_s)
 
 

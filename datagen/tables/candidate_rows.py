@@ -14,8 +14,8 @@ from datagen.schemas.fields import OUTCOMES, SCHEMAS, Field, Table
 from datagen.schemas.run import open_runs
 from datagen.schemas.shard_reading import ShardPlace
 from datagen.schemas.specification import PLACE_KINDS
-from datagen.train.reader import JOIN_FIELDS, Columns, load_shard, native
-from datagen.train.run_parts import RunPart, is_sealed_store, open_sealed
+from datagen.train.reader import Columns, load_shard, native
+from datagen.train.run_parts import JOIN_FIELDS, RunPart, is_sealed_store, open_sealed
 from datagen.workers.houses import split_of
 
 Array = npt.NDArray[Any]

@@ -28,8 +28,8 @@ from datagen.train.batching import (
 )
 from datagen.train.headings import is_other_side, side_deg_of
 from datagen.train.inputs import I64, Array, Batch
-from datagen.train.reader import JOIN_FIELDS, load_shard
-from datagen.train.run_parts import open_parts
+from datagen.train.reader import load_shard
+from datagen.train.run_parts import JOIN_FIELDS, open_parts
 from datagen.train.scene_table import TABLE_FIELDS, PartSummary, read_scene_table
 
 _CORE = (*SCENE_FIELDS, *SAMPLE_FIELDS, *JOIN_FIELDS)

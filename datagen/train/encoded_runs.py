@@ -23,24 +23,15 @@ import torch
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
 from datagen.train.dataset import SampleStream
-from datagen.train.inputs import I64, Array, Batch, Bools, RobotInputs
+from datagen.train.inputs import I64, Array, Batch, RobotInputs
 from datagen.train.models.shared import SharedModel
 from datagen.train.models.tokens import EncodedCandidates, EncodedClouds, pack, packed_width, token_sizes
 from datagen.train.tensors import to_torch
 
 # Raise it when the same run would give other tokens or columns.
 _VERSION = 4
-# Fields of a model's configuration that decide its tokens.
-_DECISIVE = (
-    "n_points",
-    "tokens",
-    "near_m",
-    "scales_m",
-    "camera",
-    "observed_visibility",
-    "hand_poses",
-    "kinematics",
-)
+# Fields of a model's configuration that do not decide its tokens.
+_OF_NETWORK = ("width", "embedding", "head", "dropout", "mirrored")
 _TOKENS, _COLUMNS = "tokens.f16", "columns.npz"
 
 
@@ -67,16 +58,6 @@ class EncodedRuns:
         """Bounds (R + 1,) of each robot's candidates."""
         robots = len(self.columns["scene_of_robot"])
         return np.searchsorted(self.columns["robot_of_candidate"], np.arange(robots + 1))
-
-    @cached_property
-    def scene_of_candidate(self) -> I64:
-        """Scene (N,) of each candidate."""
-        return self.columns["scene_of_robot"][self.columns["robot_of_candidate"]]
-
-    @property
-    def label(self) -> Array:
-        """Labels (N,), 0 or 1."""
-        return self.columns["label"]
 
     def batch(self, scenes: I64) -> Batch[Array]:
         """A batch of these scenes, in their order."""
@@ -127,19 +108,6 @@ class EncodedBatches:
         for some in np.array_split(order, self.batches_per_epoch)[skip_batches:]:
             yield self._encoded.batch(some)
 
-    @property
-    def n_samples(self) -> int:
-        """Candidates of one epoch."""
-        return int(self._chosen().sum())
-
-    def class_counts(self) -> tuple[int, int]:
-        """(negatives, positives) of one epoch."""
-        positives = int(self._encoded.label[self._chosen()].sum())
-        return self.n_samples - positives, positives
-
-    def _chosen(self) -> Bools:
-        return np.isin(self._encoded.scene_of_candidate, self._scenes)
-
 
 def _ranges(bounds: I64, rows: I64) -> tuple[I64, I64]:
     """Numbers bounds[r] .. bounds[r + 1] of all rows r, and for each number its row's index in `rows`."""
@@ -157,7 +125,7 @@ def encode_runs(
     The stream is unshuffled and has all candidates. `seen(done, of)` is called while scenes
     are encoded.
     """
-    decisive = {name: model.config[name] for name in _DECISIVE if name in model.config}
+    decisive = {name: value for name, value in model.config.items() if name not in _OF_NETWORK}
     samples = [summary.samples_sha256 for summary in stream.parts]
     key = digest_of({"version": _VERSION, "tokens": decisive, "samples": samples})
     place = folder / key

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Literal, get_args
 
 import numpy as np
 from scipy.optimize import differential_evolution
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.specification import HeuristicParams
+from datagen.schemas.specification import Distance, HeuristicParams
 from datagen.train.bootstrap import Estimate, resample_weights, summed
 from datagen.train.inputs import F32, F64, I64, Array, Bools
 from datagen.train.metrics import accuracy, balanced_accuracy, confusion
 from datagen.workers.labels.distance_visibility_score import effective_distance, heuristic, visibility_score
 
-Form = Literal["planar", "planar-over-reach", "mount-over-reach"]
-
-FORMS: tuple[Form, ...] = get_args(Form)
 FOLDS = 5
 # Fewer scenes give no meaningful interval.
 MIN_SCENES = 10
@@ -62,7 +58,7 @@ class Trials:
         return np.where(self.label, len(self) - positives, -positives).astype(np.float64)
 
 
-def begin_from(before: HeuristicParams, form: Form) -> HeuristicParams:
+def begin_from(before: HeuristicParams, form: Distance) -> HeuristicParams:
     """Initial parameters of a fit with this distance; those that are not fitted stay.
 
     For shares of the reach the bounds are 0 and 1: targets beyond the reach cannot be grasped, and sigma_l
@@ -74,7 +70,7 @@ def begin_from(before: HeuristicParams, form: Form) -> HeuristicParams:
     return before.model_copy(update={"distance": form, "d_min": bounds[0], "d_max": bounds[1]})
 
 
-def fit(trials: Trials, before: HeuristicParams, forms: Sequence[Form]) -> HeuristicParams:
+def fit(trials: Trials, before: HeuristicParams, forms: Sequence[Distance]) -> HeuristicParams:
     """The parameters mu, sigma_l, sigma_r and tau with the best balanced accuracy; others stay.
 
     The first of equally good forms wins. tau stays above alpha vis(1), so that a distance outside

@@ -236,10 +236,6 @@ def _slice(x: Array, axis: int = 0, start: int | None = None, end: int | None = 
     return x[(slice(None),) * (axis % x.ndim) + (slice(start, end, step),)]
 
 
-def _index(x: Array, rows: Sequence[Array | None]) -> Array:
-    return x[tuple(slice(None) if each is None else each for each in rows)]
-
-
 def _scatter(x: Array, axis: int, rows: Array, values: Array) -> Array:
     found = x.copy()
     np.put_along_axis(found, rows, values, axis)
@@ -280,10 +276,6 @@ def _reduced(function: Callable[..., Array]) -> Callable[..., Array]:
     return lambda x, axis=None, keepdim=False: function(x, axis=_axes(axis), keepdims=keepdim)
 
 
-def _mean(x: Array, axis: Any, keepdim: bool = False) -> Array:
-    return x.mean(axis=_axes(axis), keepdims=keepdim)
-
-
 def _real(function: Callable[..., Array]) -> Callable[..., Array]:
     """The function of two operands, of which integers take the other's type, as in torch."""
 
@@ -296,14 +288,6 @@ def _real(function: Callable[..., Array]) -> Callable[..., Array]:
     return found
 
 
-def _arange(start: int, end: int, step: int = 1, dtype: str = "int64") -> Array:
-    return np.arange(start, end, step).astype(dtype)
-
-
-def _filled_like(x: Array, value: float) -> Array:
-    return np.full_like(x, value)
-
-
 OPERATIONS: dict[str, Callable[..., Any]] = {
     "_softmax": _softmax,
     "_to_copy": lambda x, dtype=None: x if dtype is None else x.astype(dtype),
@@ -312,7 +296,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "addmm": lambda b, x, w: b + x @ w,
     "amax": _reduced(np.max),
     "amin": _reduced(np.min),
-    "arange": _arange,
+    "arange": lambda start, end, step=1, dtype="int64": np.arange(start, end, step).astype(dtype),
     "bitwise_and": operator.and_,
     "bitwise_not": operator.invert,
     "bmm": operator.matmul,
@@ -326,18 +310,18 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "exp": np.exp,
     "expand": _expand,
     "full": lambda shape, value, dtype="float32": np.full(shape, value, dtype),
-    "full_like": _filled_like,
+    "full_like": np.full_like,
     "gather": lambda x, axis, rows: np.take_along_axis(x, rows, axis),
     "getitem": operator.getitem,
     "gt": operator.gt,
     "hypot": np.hypot,
-    "index": _index,
+    "index": lambda x, rows: x[tuple(slice(None) if each is None else each for each in rows)],
     "index_select": lambda x, axis, rows: np.take(x, rows, axis),
     "le": operator.le,
     "linalg_vector_norm": _norm,
     "log1p": np.log1p,
     "lt": operator.lt,
-    "mean": _mean,
+    "mean": _reduced(np.mean),
     "mm": operator.matmul,
     "mul": _real(operator.mul),
     "native_layer_norm": _layer_norm,

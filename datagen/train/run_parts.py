@@ -14,7 +14,7 @@ from datagen.schemas.record_files import MERGED
 from datagen.schemas.run import Rows, Run, open_runs
 from datagen.schemas.run_records import MAX_FILE_BYTES, Layout
 from datagen.schemas.sealing import ZIPPED
-from datagen.schemas.shard_reading import ShardPlace, StoreFiles, StoreZip, ZipFiles, committed_place
+from datagen.schemas.shard_reading import ShardPlace, StoreFiles, ZipFiles, ZipSource, committed_place
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
 from datagen.schemas.stored_arrays import MAX_META_BYTES, StoredArray, arrays_of, readable, sources_of
@@ -204,7 +204,7 @@ def open_sealed(path: Path | str, names: Sequence[str]) -> RunPart:
     return RunPart(str(path), spec_hashes, specs, schema, version, slices, arrays, None, sources, attributes)
 
 
-def _sealed_files(path: str) -> tuple[StoreFiles | StoreZip, bytes]:
+def _sealed_files(path: str) -> tuple[StoreFiles | ZipSource, bytes]:
     """The source of a sealed store, and its root's zarr.json. InputError where it is missing."""
     is_zip = path.endswith(ZIPPED)
     folder, _, name = path.rpartition("/") if is_zip else (path, "", "zarr.json")
@@ -216,7 +216,7 @@ def _sealed_files(path: str) -> tuple[StoreFiles | StoreZip, bytes]:
     if not is_zip:
         return StoreFiles(storage), data
     files = ZipFiles(f"{storage.url}/{name}", data)
-    return StoreZip(files), files.get("zarr.json")
+    return ZipSource(files.place, lambda: files), files.get("zarr.json")
 
 
 def specs_of(path: Path | str) -> tuple[Specification, ...]:

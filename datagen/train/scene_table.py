@@ -13,8 +13,8 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import I64, Ints
-from datagen.train.reader import JOIN_FIELDS, load_shard
-from datagen.train.run_parts import RunPart, refuse_twins
+from datagen.train.reader import load_shard
+from datagen.train.run_parts import JOIN_FIELDS, RunPart, refuse_twins
 
 TABLE_FIELDS = (
     *JOIN_FIELDS,

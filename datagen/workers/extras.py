@@ -29,13 +29,9 @@ class Extra:
     brings: dict[str, str]  # import name -> name for pip
 
     def missing(self) -> list[str]:
-        """The import names that are not installed."""
-        return [name for name in self.brings if not _is_installed(name)]
-
-
-def _is_installed(name: str) -> bool:
-    """Whether a module can be found, or a distribution without modules: its name has a hyphen."""
-    return bool(versions_of([name])[name]) if "-" in name else find_spec(name) is not None
+        """The import names that are not installed; one with a hyphen is a distribution without modules."""
+        absent = {name for name, found in versions_of(self.brings).items() if not found}
+        return [n for n in self.brings if (n in absent if "-" in n else find_spec(n) is None)]
 
 
 _FILES = {"matplotlib": "matplotlib", "PIL": "pillow", "scipy": "scipy", "yaml": "pyyaml"}

@@ -24,7 +24,6 @@ from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import DECISIVE_SHARES, PLACE_KINDS, Specification
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import LabelSource, load_label_source
-from datagen.workers.rendering import Camera
 from datagen.workers.scenes import Scene
 from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.scenes.placement import draw_place
@@ -162,7 +161,7 @@ def scene_row(scene: Scene, spec: Specification) -> dict[str, Any]:
         "target_center_m": scene.target_center_m,
         "target_radius_m": scene.rays.radii_m[0],
         "T_world_camera": camera.T_world_camera,
-        "intrinsics_px": intrinsics_px(camera),
+        "intrinsics_px": (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px),
         "image_size_px": (camera.width_px, camera.height_px),
         "target_visible_fraction": scene.target_visible_fraction,
         "points_m": cloud.points_m,
@@ -170,11 +169,6 @@ def scene_row(scene: Scene, spec: Specification) -> dict[str, Any]:
         "target_mask": cloud.target_mask,
         "n_points": cloud.n,
     }
-
-
-def intrinsics_px(camera: Camera) -> tuple[float, float, float, float]:
-    """(fx, fy, cx, cy) in pixels."""
-    return (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px)
 
 
 def candidate_columns(

@@ -9,15 +9,11 @@ from dataclasses import dataclass
 from datagen.schemas.run_records import StageClock
 
 
-def _ignore(stage: str, labels: int) -> None:
-    return
-
-
 @dataclass
 class WatchedClock(StageClock):
     """Calls `watch(stage, labels)` when a stage begins: its name, and the labels made before it."""
 
-    watch: Callable[[str, int], None] = _ignore
+    watch: Callable[[str, int], None] = lambda stage, labels: None
     labels: int = 0
 
     @contextmanager

@@ -23,15 +23,17 @@ from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
 from tests.made_runs import make_run, small_spec
 
+BUILTIN = {"houses": "builtin", "objects": "builtin"}
+
 
 def test_a_run_or_sources_that_cannot_be_opened_end_the_job(tmp_path: Path) -> None:
     spec, layout = small_spec(), Layout(scenes_per_shard=2, candidates_per_scene=5)
-    task = ShardTask(str(tmp_path / "none"), spec, layout, 3, "a", "builtin", "builtin", 60)
+    task = ShardTask(3, "a", 60, run=str(tmp_path / "none"), spec=spec, layout=layout, **BUILTIN)
     assert list(task.scene_indices) == [6, 7]
     with pytest.raises(JobCannotContinue, match="no such folder"):
         run_attempt(task, Meter())
     run = make_run(tmp_path / "run", shards=())
-    other = ShardTask(run.storage.url, small_spec(seed=9), layout, 0, "a", "builtin", "builtin", 60)
+    other = ShardTask(0, "a", 60, run=run.storage.url, spec=small_spec(seed=9), layout=layout, **BUILTIN)
     with pytest.raises(JobCannotContinue, match="another specification"):
         run_attempt(other, Meter())
 
@@ -48,9 +50,8 @@ def spec() -> Specification:
 
 def attempt_at(run: Run, name: str = "a", notes: str = "") -> AttemptReport:
     """How an attempt at the first shard ends."""
-    task = ShardTask(
-        run.storage.url, run.manifest.spec, run.layout, 0, name, "builtin", "builtin", 300, notes
-    )
+    opened = {"run": run.storage.url, "spec": run.manifest.spec, "layout": run.layout}
+    task = ShardTask(0, name, 300, notes=notes, **opened, **BUILTIN)
     return guarded(run_attempt, task, deadline=False)
 
 

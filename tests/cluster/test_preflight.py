@@ -26,7 +26,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def task_of(made: Run, **changes: Any) -> ShardTask:
-    task = ShardTask(made.storage.url, made.manifest.spec, made.layout, 0, "a", "builtin", "builtin", 60.0)
+    opened = {"run": made.storage.url, "spec": made.manifest.spec, "layout": made.layout}
+    task = ShardTask(0, "a", 60.0, **opened, houses="builtin", objects="builtin")
     return replace(task, **changes)
 
 

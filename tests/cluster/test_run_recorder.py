@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.run_recorder import RunRecorder
 from datagen.cluster.shard_policy import ShardFailures
 from datagen.schemas.run_records import Cost, LedgerEntry
 from tests.made_runs import make_run, write
@@ -22,11 +22,11 @@ def test_attempts_of_a_killed_driver_are_closed_once_their_shards_are_decided(tm
     RunRecorder(run).quarantine(3, TROUBLE)
     # Nobody knows yet whether the orphan will reach its commit.
     starts = {start.attempt: start for start in run.ledger.unfinished({"won-one"})}
-    assert close_lost_attempts(run) == 2 and close_lost_attempts(run) == 0
+    assert run.close_lost_attempts() == 2 and run.close_lost_attempts() == 0
     RunRecorder(run).close(LedgerEntry(attempt="won-one", shard=1, outcome="committed", cost=won.cost))
     assert [start.attempt for start in run.ledger.unfinished({"won-one"})] == ["orphan"]
     run.commit(write(run, 2, "orphan"))
-    assert close_lost_attempts(run) == 0  # its commit is its account
+    assert run.close_lost_attempts() == 0  # its commit is its account
     ends = {entry.attempt: entry for entry in run.ledger.ends()}
     assert {name: (entry.outcome, entry.shard) for name, entry in ends.items()} == {
         "lost-one": ("lost", 0), "hopeless": ("lost", 3),
@@ -46,7 +46,7 @@ def test_an_attempt_taken_for_lost_replaces_that_by_its_own_account(tmp_path: Pa
     run = make_run(tmp_path / "run", shards=())
     run.ledger.start("slow", 0)
     run.commit(write(run, 0, "fast"))
-    assert close_lost_attempts(run) == 1
+    assert run.close_lost_attempts() == 1
     for seconds in (7.0, 9.0):  # an account stands, whoever comes later
         cost = Cost(wall_s=seconds, cpu_s=6)
         RunRecorder(run).close(LedgerEntry(attempt="slow", shard=0, outcome="superseded", cost=cost))

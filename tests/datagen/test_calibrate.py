@@ -13,8 +13,8 @@ import pytest
 from datagen import cli
 from datagen.schemas.run import Run
 from datagen.schemas.specification import CandidateParams, HeuristicParams, Specification
-from datagen.train.reader import SampleReader
 from datagen.workers.labels.distance_visibility_score import heuristic
+from tests.columns import columns_of
 from tests.made_runs import make_run, small_spec
 from tests.refusals import refused
 from tests.small_runs import arrays_of, json_of, submit_arguments
@@ -78,7 +78,7 @@ def test_what_is_told_is_so(trials: Path, tmp_path: Path, capsys: pytest.Capture
     told = calibrated(trials, tmp_path / "rule.toml", capsys)
     [rows] = [
         {name: np.concatenate([s[name] for s in shards]) for name in shards[0]}
-        for shards in [list(SampleReader([trials], ("house_id",), SAMPLE_FIELDS).shards())]
+        for shards in [columns_of(trials, ("house_id", *SAMPLE_FIELDS))]
     ]
     clear = rows["base_is_clear"]
     label = rows["label"][clear] == 1

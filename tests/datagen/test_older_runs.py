@@ -14,8 +14,8 @@ from datagen.configuration import specify
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_scene
-from datagen.train.reader import SampleReader
 from datagen.workers.rendering import RENDERERS
+from tests.columns import columns_of
 from tests.refusals import refused
 from tests.small_runs import CONFIG, HERE, PER_SCENE, arrays_of, assert_equal_runs, make_small_run
 
@@ -50,7 +50,7 @@ def test_every_reader_gives_headings_that_face_the_target(older: Path) -> None:
         table = datagen.candidates(place)
         np.testing.assert_allclose(table["base_yaw_world_rad"], wanted, atol=1e-6)
         np.testing.assert_allclose(datagen.candidates(place, columns=[YAW])[YAW], wanted, atol=1e-6)
-        read = [shard[YAW] for shard in SampleReader([place], (), (YAW,)).shards()]
+        read = [shard[YAW] for shard in columns_of(place, [YAW])]
         np.testing.assert_allclose(np.concatenate(read), wanted, atol=1e-6)
         dataset = datagen.open_dataset(place)
         assert dataset[YAW].attrs["units"] == "rad" and dataset[YAW].dtype == np.float32

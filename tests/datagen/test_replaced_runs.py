@@ -23,7 +23,7 @@ N = 8 * PER_SCENE
 MOMENTS: dict[str, tuple[Any, str]] = {
     "while a shard is made": (datagen.cluster.attempt, "run_shard"),
     "between shards": (RunRecorder, "close"),
-    "after the last shard": (datagen.jobs.job, "close_lost_attempts"),
+    "after the last shard": (Run, "close_lost_attempts"),
     "before it is sealed": (Job, "_judged"),
 }
 

@@ -15,7 +15,7 @@ from datagen import cli
 from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage
 from datagen.train.dataset import SampleStream
-from datagen.train.reader import SampleReader
+from tests.columns import columns_of
 from tests.refusals import refused
 from tests.schemas.checked import stored
 from tests.small_runs import CONFIG, PER_SCENE, arrays_of, assert_equal_runs, json_of, make_small_run
@@ -66,9 +66,9 @@ def test_worker_processes_write_to_s3_and_a_reader_reads_it(
     assert '"shards_done": 2' in told.out + told.err
     local = make_small_run(tmp_path / "local", 16)
     assert_equal_runs(stored(Run.open(out).storage), arrays_of(local))
-    whole = list(SampleReader([local]).shards())
+    whole = columns_of(local)
     for place in (out, f"{out}/data.zarr"):
-        for ours, theirs in zip(SampleReader([place]).shards(), whole, strict=True):
+        for ours, theirs in zip(columns_of(place), whole, strict=True):
             assert ours.keys() == theirs.keys()
             for name in ours:
                 np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)

@@ -8,7 +8,6 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from datagen.cluster.run_recorder import close_lost_attempts
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from tests.conftest import REPOSITORY
@@ -39,7 +38,7 @@ def run_pair(address: str, shards: int, seconds: float, folder: Path, kill: bool
             assert job.returncode == 0 and json.loads(out)["end"] == "complete", err
             outcomes.update(json.loads(out)["outcomes"])
     run = Run.open(address)
-    close_lost_attempts(run)
+    run.close_lost_attempts()
     seal(run.storage)
     check_ledger(run, set())
     check_undisturbed(run, shards, folder / "undisturbed")

@@ -18,7 +18,7 @@ from typing import Any
 from datagen.cluster.attempt_guard import Meter, this_host
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.protocol import AttemptResult, StopRequest
-from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.run_recorder import RunRecorder
 from datagen.cluster.shard_policy import OpenShards, RetryPolicy
 from datagen.reports.audit import account_for
 from datagen.schemas.record_files import commit_key
@@ -112,7 +112,7 @@ def drive_counted(
         together.wait(300)
     drive(run.missing(), make_task, executor, RunRecorder(run), PATIENT, Heard(), StopRequest())
     executor.close()
-    close_lost_attempts(run)
+    run.close_lost_attempts()
 
 
 def start_driver(

@@ -9,7 +9,6 @@ from hashlib import sha256
 from pathlib import Path
 from uuid import uuid4
 
-from datagen.cluster.run_recorder import close_lost_attempts
 from datagen.jobs.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.repair import clean_runs, repair_runs
@@ -138,7 +137,7 @@ def _make_anew(folder: Path, shard: int, name: str) -> None:
     run = Run.open(folder)
     if shard not in run.committed():
         attempt(run, shard, name)
-    close_lost_attempts(run)
+    run.close_lost_attempts()
 
 
 def _guess(folder: Path) -> None:
@@ -236,7 +235,7 @@ def remake(folder: Path) -> None:
     for run in open_runs(storage):
         for shard in run.missing():
             attempt(run, shard, f"again-{shard}-{uuid4().hex[:8]}")
-        close_lost_attempts(run)
+        run.close_lost_attempts()
     seal(storage)
 
 

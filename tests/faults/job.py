@@ -19,7 +19,7 @@ from datagen.cluster.job_monitor import JobProgress
 from datagen.cluster.protocol import AttemptResult, StopRequest, stop_on_signals
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import ray_executor
-from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.run_recorder import RunRecorder
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.display.progress import Progress
 from datagen.schemas.run import Run
@@ -69,7 +69,7 @@ def main() -> int:
     said = {
         "end": summary.end,
         "cause": summary.cause,
-        "closed": close_lost_attempts(run),
+        "closed": run.close_lost_attempts(),
         "outcomes": summary.totals.outcomes,
     }
     print(json.dumps(said))

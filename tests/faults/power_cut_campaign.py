@@ -74,7 +74,7 @@ def make_in_steps(folder: str, noted: str, shards: int) -> None:
         run.grow(step * per_step)
         executor, heard = InProcessExecutor(make_durable), Heard(on_tick=on_tick)
         drive(run.missing(), make_task, executor, RunRecorder(run), RetryPolicy(), heard, StopRequest())
-        run.close_lost_attempts(utc_now())
+        run.close_lost_attempts()
         seal(storage)
         count(noted, "sealed", "-")
 

@@ -13,9 +13,9 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, TypeVar
 
 from datagen.cluster.attempt_guard import Meter, failure_report, guarded, read_note
-from datagen.cluster.protocol import AttemptReport, AttemptResult, Task
+from datagen.cluster.protocol import AttemptOrder, AttemptReport, AttemptResult
 
-T = TypeVar("T", bound=Task)
+T = TypeVar("T", bound=AttemptOrder)
 # Forked from a driver that has one thread and has loaded everything: a new worker takes milliseconds. (A
 # fork server would not do: it ends when a driver is killed in the moment of asking it.)
 _FORKS = multiprocessing.get_context("fork")

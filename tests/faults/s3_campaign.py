@@ -9,7 +9,7 @@ from pathlib import Path
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.protocol import StopRequest
-from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.run_recorder import RunRecorder
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.errors import InputError
@@ -77,7 +77,7 @@ def _job(address: str, shards: int, counted: str) -> Run:
 
     policy, executor = RetryPolicy(), InProcessExecutor(make_counted)
     drive(run.missing(), make_task, executor, RunRecorder(run), policy, Heard(), StopRequest())
-    close_lost_attempts(run)
+    run.close_lost_attempts()
     return run
 
 

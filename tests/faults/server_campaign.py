@@ -14,7 +14,7 @@ from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.protocol import JobSummary, JobTotals, StopRequest
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import ray_executor
-from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.run_recorder import RunRecorder
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.reports.audit import account_for
 from datagen.schemas.run import Run
@@ -47,7 +47,7 @@ def one_job(run: Run, seconds: float, on_tick: Callable[[Any, JobTotals], None])
 
         heard = Heard(on_tick=lambda totals: on_tick(ray, totals))
         summary = drive(run.missing(), make_task, executor, RunRecorder(run), POLICY, heard, StopRequest())
-    close_lost_attempts(run)
+    run.close_lost_attempts()
     return summary
 
 

@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 
 from datagen import cli
-from datagen.cluster.run_recorder import close_lost_attempts
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.run import Run
@@ -88,7 +87,7 @@ def program(words: list[str]) -> int:
         run = Run.open(words[1])
         if 1 not in run.committed():
             attempt(run, 1, f"b-{len(run.ledger.attempts())}")
-        close_lost_attempts(run)  # as every driver does
+        run.close_lost_attempts()  # as every driver does
     except InputError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2

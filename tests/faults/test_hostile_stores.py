@@ -16,7 +16,7 @@ from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.storage import open_storage
-from datagen.train.reader import SampleReader
+from tests.columns import columns_of
 from tests.faults.crash_points_operations import small_schema
 from tests.faults.damage_campaign import make_place
 from tests.faults.hostile_stores import HOSTILE, OBJECT, odd_names
@@ -78,8 +78,7 @@ def little_memory() -> Generator[None]:
 def read_all(place: str) -> int:
     """What every reader of columns does."""
     try:
-        for _ in SampleReader([place], ("points_m", "house_id"), ("label", "sample_id")).shards():
-            pass
+        columns_of(place, ("points_m", "house_id", "label", "sample_id"))
     except InputError as error:
         assert len(str(error)) < 2000
         return 2

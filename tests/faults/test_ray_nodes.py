@@ -115,8 +115,8 @@ def test_a_machine_that_does_not_see_the_run_is_named_and_left_out(
     executor = RayExecutor(run_attempt, replace(machines.settings, tell=said.append), machines.ray)
 
     def make_task(order: AttemptOrder) -> ShardTask:
-        attempt, spec = order.attempt, run.manifest.spec
-        return ShardTask("~/run", spec, run.layout, order.shard, attempt, "builtin", "builtin", 600.0)
+        opened = {"run": "~/run", "spec": run.manifest.spec, "layout": run.layout}
+        return ShardTask(order.shard, order.attempt, 600.0, **opened, houses="builtin", objects="builtin")
 
     recorder = RunRecorder(run)
     summary = drive(run.missing(), make_task, executor, recorder, RetryPolicy(), Heard(), StopRequest())

@@ -13,7 +13,7 @@ from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.protocol import StopRequest
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
-from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.run_recorder import RunRecorder
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.schemas.run import Run
 from tests.cluster.simulated import Heard
@@ -98,7 +98,7 @@ def test_a_trial_that_kills_its_worker_costs_one_attempt_and_a_resumed_run_is_th
     with ray_cluster(settings) as ray:
         executor = RayExecutor(attempt_with_faults, settings, ray)
         summary = drive(run.missing(), make_task, executor, RunRecorder(run), policy, Heard(), StopRequest())
-    assert summary.end == "complete" and not close_lost_attempts(run)
+    assert summary.end == "complete" and not run.close_lost_attempts()
 
     ends = {shard: [e.outcome for e in run.ledger.ends() if e.shard == shard] for shard in range(SHARDS)}
     assert ends == {0: ["crashed"], 1: ["hung"], 2: ["crashed"], 3: ["failed"], 4: ["crashed"] * 3, 5: []}

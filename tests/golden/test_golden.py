@@ -11,7 +11,7 @@ import pytest
 
 import datagen
 from datagen import cli
-from datagen.train.reader import SampleReader
+from tests.columns import columns_of
 from tests.golden.make import GOLDEN, TOLD, held
 from tests.small_runs import arrays_of
 
@@ -24,6 +24,6 @@ def test_files_of_a_release_open_and_hold_what_they_held(version: str, tmp_path:
     assert cli.run(["verify", str(run)]) == 0
     arrays = arrays_of(run)
     for place in (run, run / "data.zarr"):
-        read = list(SampleReader([place]).shards())
+        read = columns_of(place)
         np.testing.assert_array_equal(np.concatenate([shard["label"] for shard in read]), arrays["label"])
         assert len(datagen.candidates(place)) == len(arrays["label"])

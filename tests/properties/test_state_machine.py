@@ -20,7 +20,6 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from datagen.cluster.run_recorder import close_lost_attempts
 from datagen.jobs.relabelling import relabel_run, relabelled_specification
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.repair import clean_runs, repair_runs
@@ -62,7 +61,7 @@ def findings(place: Place) -> list[Any]:
 
 def close_all(place: Place) -> None:
     for run in open_runs(place.folder):
-        close_lost_attempts(run)
+        run.close_lost_attempts()
 
 
 def store_name(folder: Path) -> str | None:
@@ -153,7 +152,7 @@ class AnyHistory(RuleBasedStateMachine):
                 for shard in part.missing:
                     assert attempt(run, shard, self.attempt_name())
                 place.parts[key] = replace(part, committed=part.committed | set(part.missing))
-            close_lost_attempts(run)
+            run.close_lost_attempts()
 
     @rule(data=st.data(), shards=st.integers(1, SHARDS_AT_MOST))
     def extend(self, data: st.DataObject, shards: int) -> None:

@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.specification import HeuristicParams
+from datagen.schemas.specification import DISTANCES, HeuristicParams
 from datagen.train.heuristic_fit import (
-    FORMS,
     Trials,
     agreements,
     begin_from,
@@ -51,7 +50,7 @@ hidden_rules = st.builds(
             "tau": 0.51 * 0.6 + 0.49 * float(np.exp(-0.5 * sigmas**2)),
         }
     ),
-    st.sampled_from(FORMS),
+    st.sampled_from(DISTANCES),
     st.floats(0.35, 0.8),
     st.floats(0.05, 0.4),
     st.floats(0.05, 0.4),
@@ -92,7 +91,7 @@ def test_row_order_changes_neither_the_fit_nor_the_report(seed: int) -> None:
     np.testing.assert_array_equal(a.resamples, b.resamples)
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", DISTANCES)
 def test_no_random_rule_does_better_than_the_fitted_one(form: Any) -> None:
     """On labels that no rule explains, the fit is at least as good as the best of 2,000 guesses."""
     trials, rng = make_trials(7, n=400), np.random.default_rng(8)

@@ -16,19 +16,24 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_reading import read_scene
 from datagen.train.dataset import SampleStream
-from datagen.train.reader import SampleReader
+from datagen.train.reader import read_shards
+from datagen.train.run_parts import JOIN_FIELDS, RunPart, open_parts
+from tests.columns import columns_of, opened
 from tests.made_runs import make_run, rows_of
 from tests.train.stream_runs import make_stream_run
 
-ALL = ("scene_index", *("points_m", "rgb", "target_mask", "house_id", "object_name"))
 SAMPLES = ("sample_id", "sample_scene_index", "candidate_index", "distance_m", "label", "label_source")
+ALL = ("points_m", "rgb", "target_mask", "house_id", "object_name", *SAMPLES)
+
+
+def samples_in(parts: list[RunPart]) -> int:
+    return sum(shard.samples for part in parts for shard in part.shards)
 
 
 def test_shards_are_the_committed_rows_with_their_scenes(tmp_path: Path):
     run = make_run(tmp_path, n=43)
-    reader = SampleReader([tmp_path], ALL, SAMPLES)
-    assert (len(reader), reader.n_scenes) == (43, 9)
-    shards = list(reader.shards())
+    shards = columns_of(tmp_path, ALL)
+    assert sum(len(s["scene_index"]) for s in shards) == 9
     assert [len(s["label"]) for s in shards] == [10, 10, 10, 10, 3]
     for k, s in enumerate(shards):
         scenes, samples = rows_of(run, k)
@@ -43,12 +48,12 @@ def test_shards_are_the_committed_rows_with_their_scenes(tmp_path: Path):
 def test_a_copied_sealed_store_reads_like_its_run_which_may_be_named_like_one(tmp_path: Path):
     run = make_run(tmp_path / "run.zarr", n=48, shards=[0, 2, 4])
     shutil.copytree(seal(run.storage), tmp_path / "alone.zarr")
-    assert len(SampleReader([tmp_path / "run.zarr"], allow_incomplete=True)) == 28
+    assert samples_in(opened(tmp_path / "run.zarr", allow_incomplete=True)) == 28
     (tmp_path / "run.zarr/shards/a-2.zip").unlink()
-    sealed = SampleReader([tmp_path / "alone.zarr"], ALL, SAMPLES)
-    batches = list(sealed.shards())
+    sealed = opened(tmp_path / "alone.zarr", ALL)
+    batches = list(read_shards(sealed))
     assert [len(b["label"]) for b in batches] == [10, 10, 8]
-    assert len(sealed) == 28
+    assert samples_in(sealed) == 28
     for b, shard in zip(batches, (0, 2, 4), strict=True):
         stored = rows_of(run, shard)[1]["distance_m"]
         np.testing.assert_array_equal(b["distance_m"], stored[: len(b["distance_m"])])
@@ -59,48 +64,47 @@ def test_every_bit_flip_of_an_object_is_detected_and_named(tmp_path: Path):
     rng = np.random.default_rng(3)
     victim = tmp_path / "shards/a-1.zip"
     whole = victim.read_bytes()
-    reader = SampleReader([tmp_path], ALL, SAMPLES)
-    list(reader.shards())  # from here on checksums inside the object guard the chunks
+    parts = opened(tmp_path, ALL)
+    list(read_shards(parts))  # from here on checksums inside the object guard the chunks
     rows = whole.index(b"distance_m/c.0") + 30  # within a chunk that is read
     for bit in [*rng.integers(0, 8 * len(whole), 60), 8 * rows]:
         data = bytearray(whole)
         data[bit // 8] ^= 1 << (bit % 8)
         victim.write_bytes(data)
         with pytest.raises(InputError, match=r"a-1\.zip: .*another sha256"):
-            list(SampleReader([tmp_path], ALL, SAMPLES).shards())
+            columns_of(tmp_path, ALL)
     with pytest.raises(InputError, match=r"a-1\.zip/distance_m/c\.0: "):
-        list(reader.shards())
+        list(read_shards(parts))
     victim.write_bytes(whole)
-    assert len(list(reader.shards())) == 2
+    assert len(list(read_shards(parts))) == 2
 
 
 def test_missing_and_cut_objects_are_named(tmp_path: Path):
     make_run(tmp_path, n=20)
     victim = tmp_path / "shards/a-0.zip"
-    reader = SampleReader([tmp_path])
+    parts = opened(tmp_path)
     victim.write_bytes(victim.read_bytes()[:-3])
     with pytest.raises(InputError, match=r"a-0\.zip: has \d+ bytes with another sha256"):
-        next(reader.shards())
+        next(read_shards(parts))
     victim.unlink()
     with pytest.raises(InputError, match=r"a-0\.zip: no such file"):
-        next(reader.shards())
+        next(read_shards(parts))
 
 
 def test_unreadable_runs_are_refused(tmp_path: Path):
     make_run(tmp_path / "run", n=20)
     make_run(tmp_path / "bare", n=20, shards=[])
     (tmp_path / "odd.zarr").mkdir()
-    cases: list[tuple[list[Path], dict[str, Any], str]] = [
-        ([], {}, "no run is given"),
-        ([tmp_path / "bare"], {"allow_incomplete": True}, "no shard is committed"),
-        ([tmp_path / "odd.zarr"], {}, "no such file"),
-        ([tmp_path / "none"], {}, "no such folder"),
-        ([tmp_path / "run"], {"sample_fields": ("beauty",)}, "beauty: is not a field of the run"),
-        ([tmp_path / "run"], {"sample_fields": ("points_m",)}, "points_m: is not a field of samples"),
+    cases = [
+        ([], "label", "no run is given"),
+        ([tmp_path / "bare"], "label", "no shard is committed"),
+        ([tmp_path / "odd.zarr"], "label", "no such file"),
+        ([tmp_path / "none"], "label", "no such folder"),
+        ([tmp_path / "run"], "beauty", "beauty: is not a field of the run"),
     ]
-    for places, fields, problem in cases:
+    for places, name, problem in cases:
         with pytest.raises(InputError, match=problem):
-            SampleReader(places, **fields)
+            open_parts(places, (*JOIN_FIELDS, name), allow_incomplete=True)
 
 
 def test_hostile_metadata_of_a_sealed_store_is_refused(tmp_path: Path):
@@ -122,12 +126,12 @@ def test_hostile_metadata_of_a_sealed_store_is_refused(tmp_path: Path):
         assert old in text
         meta.write_text(text.replace(old, new))
         with pytest.raises(InputError):
-            list(SampleReader([path]).shards())
+            columns_of(path)
     broken = '{"attributes": {}}', '{"attributes": 3}', '{"attributes": null}', "[" * 100_000
     for text in ("", "{}", "[]", *broken):
         root.write_text(text)
         with pytest.raises(InputError, match="not the root of a sealed store"):
-            SampleReader([path])
+            opened(path)
 
 
 @pytest.mark.parametrize("remote", [False, True])
@@ -141,7 +145,7 @@ def test_objects_that_were_swapped_are_refused_by_every_reader(
     for key, other in zip(keys, [run.storage.get(key, 2**20) or b"" for key in reversed(keys)], strict=True):
         run.storage.put(key, other)
     for read in (
-        lambda: list(SampleReader([place]).shards()),
+        lambda: columns_of(place),
         lambda: read_labels(run),
         lambda: read_scene(run, 0),
         lambda: SampleStream([place]),
@@ -161,10 +165,10 @@ def test_an_object_is_checked_against_its_commit_once_per_process(
         return sha256(data)
 
     monkeypatch.setattr(run_module, "sha256", counted)
-    reader = SampleReader([tmp_path], ("points_m",), ("label",))
-    first = list(reader.shards())
+    parts = opened(tmp_path, ("points_m", "label"))
+    first = list(read_shards(parts))
     assert len(hashed) == 2
-    for again, before in zip(reader.shards(), first, strict=True):
+    for again, before in zip(read_shards(parts), first, strict=True):
         np.testing.assert_array_equal(again["label"], before["label"])
     assert len(hashed) == 2
 
@@ -173,11 +177,11 @@ def test_an_incomplete_run_is_read_only_with_allow_incomplete(tmp_path: Path):
     make_run(tmp_path, n=30)
     (tmp_path / "commits/000001.json").unlink()
     words = r"10 of the 30 planned samples are missing\. .*resume.*allow an incomplete run"
-    for opened in (lambda: SampleReader([tmp_path]), lambda: SampleStream([tmp_path])):
+    for read in (lambda: opened(tmp_path), lambda: SampleStream([tmp_path])):
         with pytest.raises(InputError, match=words) as error:
-            opened()
+            read()
         assert error.value.place == str(tmp_path)
-    assert len(SampleReader([tmp_path], allow_incomplete=True)) == 20
+    assert samples_in(opened(tmp_path, allow_incomplete=True)) == 20
     assert SampleStream([tmp_path], allow_incomplete=True).n_samples == 20
 
 
@@ -185,4 +189,4 @@ def test_numbers_that_no_run_stores_are_refused(tmp_path: Path):
     for value in (np.nan, np.inf):
         make_stream_run(tmp_path / str(value), 36, distance_m=value)
         with pytest.raises(InputError, match="distance_m: holds NaN or infinite numbers"):
-            list(SampleReader([tmp_path / str(value)], ("house_id",), ("distance_m",)).shards())
+            columns_of(tmp_path / str(value), ["distance_m"])

@@ -6,7 +6,7 @@ completed by running it again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -105,12 +105,8 @@ def plan_merge(paths: Sequence[str], out: str, tick: Tick = lambda: None) -> Mer
     return MergePlan(out, parts, tuple(divide_scenes(parts)))
 
 
-def merge_runs(
-    merge: MergePlan,
-    tick: Tick = lambda: None,
-    sealing: Callable[[int, int], None] = lambda done, total: None,
-) -> MergeResult:
-    """Write a planned merge and seal it; `tick` is called for every shard, `sealing` as by `seal`.
+def merge_runs(merge: MergePlan, tick: Tick = lambda: None) -> MergeResult:
+    """Write a planned merge and seal it; `tick` is called for every shard.
 
     Called again, it completes an interrupted merge, and changes nothing in a complete one. InputError where a
     source lacks a committed object, or it is damaged.
@@ -128,7 +124,7 @@ def merge_runs(
             if storage.get(key, MAX_RECORD_BYTES) != record:
                 storage.put(key, record)
     has_labels = label_counts(open_runs(storage)).labels > 0
-    return MergeResult(storage, tuple(written), seal(storage, sealing) if has_labels else "")
+    return MergeResult(storage, tuple(written), seal(storage) if has_labels else "")
 
 
 def _begin(part: Part, plan: Plan, storage: Storage) -> Run:
@@ -162,7 +158,7 @@ def _write(part: Part, run: Run, tick: Tick) -> WrittenPart:
         if run.commit_of(commit.shard).attempt != commit.attempt:
             start = part.runs[source].ledger.start_of(commit.attempt)
             run.ledger.end(superseded_end(commit, SPARE_CAUSE, start.started if start else ""))
-    run.close_lost_attempts()  # of shards that another source has
+    run.close_lost_attempts("")  # of shards that another source has
     return WrittenPart(run, len(there), len(new), len(part.spare))
 
 

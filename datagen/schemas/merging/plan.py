@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import RecordSchema, SceneRows
-from datagen.schemas.record_files import different_fields, encode_record, part_folder
+from datagen.schemas.record_files import different_fields, encode_record
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import OPEN_END, Commit, Layout, Manifest, MergedPart, Plan
 from datagen.schemas.shard_ranges import ShardRanges
@@ -50,7 +50,8 @@ class Part:
 
     @property
     def folder(self) -> str:
-        return part_folder(*self.key)
+        """Its folder in merged runs."""
+        return f"parts/{self.key[0][:16]}-{self.key[1]}"
 
     @property
     def scenes(self) -> ShardRanges:

@@ -8,7 +8,6 @@ relative to the target's count (Vahrenkamp et al. 2013, "Robot placement based o
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -113,18 +112,15 @@ def _backed(poses: ReachabilityMap, back: float) -> F32:
     distance = np.repeat((np.arange(rings) + 0.5) / poses.cells_per_reach, heights)
     height = np.tile((np.arange(heights) + 0.5) / poses.cells_per_reach + poses.lowest, rings)
     found = np.empty((rings * heights, LEVELS, AZIMUTHS), np.float32)
-    for (level, azimuth), (x, y, z) in _by_part(part_directions()):
+    directions = part_directions()
+    for level, azimuth in np.ndindex(*directions.shape[:2]):
+        x, y, z = directions[level, azimuth]
         # The hand moves along a line: behind, its direction is the same, its azimuth from the mount is not.
         behind = np.hypot(distance - back * x, back * y)
         turn = np.arctan2(-back * y, distance - back * x) / (2 * np.pi) * AZIMUTHS
         seen = (azimuth - np.round(turn).astype(int)) % AZIMUTHS
         found[:, level, azimuth] = poses.at(behind, height - back * z)[np.arange(len(seen)), level, seen]
     return found.reshape(poses.reachable.shape)
-
-
-def _by_part(directions: F64) -> Iterator[tuple[tuple[int, int], F64]]:
-    for level, azimuth in np.ndindex(*directions.shape[:2]):
-        yield (level, azimuth), directions[level, azimuth]
 
 
 _ROLLS = 4  # in half a turn about the approach: the hand is the same after half a turn

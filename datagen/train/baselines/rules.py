@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 
-from datagen.schemas.specification import HeuristicParams
+from datagen.schemas.specification import DISTANCES, Distance, HeuristicParams
 from datagen.train.baselines.baseline import (
     RULED_OUT,
     Unfitted,
@@ -21,7 +21,7 @@ from datagen.train.baselines.baseline import (
     refitted_cut,
 )
 from datagen.train.inputs import F64, Array, Batch, Bools, is_clear
-from datagen.workers.labels.distance_visibility_score import heuristic
+from datagen.workers.labels.distance_visibility_score import effective_distance, heuristic
 
 _BEST_SHARE, _SHARE_WIDTH = 0.75, 0.1
 
@@ -117,8 +117,6 @@ class Analytic(Unfitted):
         return {"params": self.params.model_dump(mode="json"), "only_clear": self.only_clear}
 
 
-Kind = Literal["planar", "planar-over-reach", "mount-over-reach"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
 _EDGES = 101
 
 
@@ -126,7 +124,7 @@ _EDGES = 101
 class DistanceBand:
     """Positive where low <= d <= high and the base is clear, d being a distance of the heuristic."""
 
-    kind: Kind = "planar"
+    kind: Distance = "planar"
     low: float = float("nan")
     high: float = float("nan")
     name = "distance"
@@ -145,23 +143,18 @@ class DistanceBand:
         """The kind and band with the best balanced accuracy; edges are quantiles of d."""
         label = labels(batches, self.name)
         clear = np.concatenate([is_clear(b) for b in batches])
-        distances = {kind: np.concatenate([_distance(b, kind) for b in batches]) for kind in KINDS}
+        distances = {kind: np.concatenate([_distance(b, kind) for b in batches]) for kind in DISTANCES}
         bands = {kind: _best_band(d, label, clear) for kind, d in distances.items()}
-        kind = max(KINDS, key=lambda kind: bands[kind][0])
+        kind = max(DISTANCES, key=lambda kind: bands[kind][0])
         return replace(self, kind=kind, low=bands[kind][1], high=bands[kind][2])
 
     def state(self) -> dict[str, Any]:
         return {"kind": self.kind, "low": self.low, "high": self.high}
 
 
-def _distance(batch: Batch[Array], kind: Kind) -> F64:
-    match kind:
-        case "planar":
-            return planar_distance_m(batch)
-        case "planar-over-reach":
-            return planar_distance_m(batch) / reach_m(batch)
-        case "mount-over-reach":
-            return mount_m(batch) / reach_m(batch)
+def _distance(batch: Batch[Array], kind: Distance) -> F64:
+    distances_m = planar_distance_m(batch), mount_m(batch), reach_m(batch)
+    return effective_distance(*distances_m, HeuristicParams(distance=kind))
 
 
 def _best_band(d: F64, label: Bools, clear: Bools) -> tuple[float, float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import torch
@@ -38,7 +38,7 @@ class Model(nn.Module, ABC):
         self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
     ) -> Tensor:
         """Logits (N, 2), float32; column 1 is "good". All tensors on the model's device."""
-        return self(clouds, candidates, robots)
+        return self(clouds, candidates, robots) if len(candidates) else candidates.base_xy_m.new_zeros((0, 2))
 
     @abstractmethod
     def forward(
@@ -66,6 +66,15 @@ class Model(nn.Module, ABC):
     def device(self) -> torch.device:
         """Device of the parameters."""
         return next(self.parameters()).device
+
+
+def layers(width_in: int, widths: Sequence[int], norm: bool = True) -> nn.Sequential:
+    """Linear layers with ReLU, and with LayerNorm before it."""
+    made: list[nn.Module] = []
+    for width in widths:
+        made += [nn.Linear(width_in, width), *([nn.LayerNorm(width)] if norm else []), nn.ReLU()]
+        width_in = width
+    return nn.Sequential(*made)
 
 
 def read_config(kind: type[ConfigT], name: str, config: Mapping[str, Any]) -> ConfigT:

@@ -18,7 +18,7 @@ target; and frames along the principal axes of the points in place of clouds ren
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import torch
@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from datagen.train.inputs import CandidateInputs, Clouds, RobotInputs
 from datagen.train.models.crop import Crop, crop_clouds
-from datagen.train.models.model import Model, ModelConfig, read_config
+from datagen.train.models.model import Model, ModelConfig, layers, read_config
 from datagen.train.models.tokens import target_frame_points, turned
 
 _MIN_REACH_M = 0.05
@@ -67,10 +67,10 @@ class N2mModel(Model):
         self.sizes = read_config(N2mConfig, self.name, config)
         super().__init__(self.sizes)
         # Without norms, which would take most of the time: there are many points.
-        self.points = _layers(_N_POINT, self.sizes.widths, norm=False)
+        self.points = layers(_N_POINT, self.sizes.widths, norm=False)
         width = 2 * self.sizes.widths[-1] + _N_ROBOT
         last = self.sizes.head[-1] if self.sizes.head else width
-        self.head = nn.Sequential(_layers(width, self.sizes.head, norm=True), nn.Dropout(self.sizes.dropout))
+        self.head = nn.Sequential(layers(width, self.sizes.head), nn.Dropout(self.sizes.dropout))
         self.mixture = nn.Linear(last, self.sizes.components * _PER_COMPONENT)
         self._begin_on_a_ring()
 
@@ -89,8 +89,6 @@ class N2mModel(Model):
         self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
     ) -> Tensor:
         """Logits (N, 2): logarithms of both probabilities."""
-        if not len(candidates):
-            return candidates.base_xy_m.new_zeros((0, 2))
         with torch.no_grad():
             crop = crop_clouds(clouds, robots, self.sizes.n_points)
             points = target_frame_points(crop)
@@ -113,25 +111,13 @@ class N2mModel(Model):
         valid = crop.valid[:, None, :, None]
         hidden = self.points(features) * valid
         mean = hidden.sum(2) / valid.sum(2).clamp(min=1)
-        rise, radius = crop.target_rise_m, _radius_m(crop)
+        distance = torch.linalg.vector_norm(target_frame_points(crop), dim=2)
+        radius = distance.masked_fill(~crop.target_mask, 0.0).amax(1)  # of the target around its centre
+        rise = crop.target_rise_m
         of_robot = torch.stack([reach_m, rise, rise / reach_m, 10 * radius], dim=1)
         of_robot = of_robot[:, None].expand(-1, views.shape[1], -1)
         known = self.head(torch.cat([hidden.amax(2), mean, of_robot], dim=2))
         return self.mixture(known).unflatten(2, (self.sizes.components, _PER_COMPONENT)).float()
-
-
-def _layers(width_in: int, widths: Sequence[int], norm: bool) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for width in widths:
-        layers += [nn.Linear(width_in, width), *([nn.LayerNorm(width)] if norm else []), nn.ReLU()]
-        width_in = width
-    return nn.Sequential(*layers)
-
-
-def _radius_m(crop: Crop) -> Tensor:
-    """Distance (R,) of the farthest point of the target from its centre."""
-    distance = torch.linalg.vector_norm(target_frame_points(crop), dim=2)
-    return distance.masked_fill(~crop.target_mask, 0.0).amax(1)
 
 
 def _principal_axes(points_m: Tensor, valid: Tensor) -> Tensor:

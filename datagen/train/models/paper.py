@@ -119,8 +119,6 @@ class PaperModel(Model):
         self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
     ) -> Tensor:
         """Logits (N, 2)."""
-        if not len(candidates):
-            return candidates.base_xy_m.new_zeros((0, 2))
         with torch.no_grad():
             groups = self._group(crop_clouds(clouds, robots, self.sizes.n_points))
         chunk = len(candidates) if self.training else _CHUNK

@@ -38,7 +38,7 @@ from datagen.train.models.frames import (
     target_features,
 )
 from datagen.train.models.hand_pooling import N_SEEN_FROM_MOUNT, HandPooling, tiles
-from datagen.train.models.model import Model, ModelConfig, read_config
+from datagen.train.models.model import Model, ModelConfig, layers, read_config
 from datagen.train.models.tokens import (
     N_KINDS,
     TARGET_NUMBERS,
@@ -110,12 +110,8 @@ def with_reach(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def mlp(width_in: int, widths: Sequence[int], width_out: int) -> nn.Sequential:
-    """Linear layers with LayerNorm and ReLU between them; the last one is linear alone."""
-    layers: list[nn.Module] = []
-    for width in widths:
-        layers += [nn.Linear(width_in, width), nn.LayerNorm(width), nn.ReLU()]
-        width_in = width
-    return nn.Sequential(*layers, nn.Linear(width_in, width_out))
+    """`layers`, and a linear one."""
+    return nn.Sequential(*layers(width_in, widths), nn.Linear(widths[-1] if widths else width_in, width_out))
 
 
 class SharedModel(Model):
@@ -172,8 +168,6 @@ class SharedModel(Model):
         self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
     ) -> Tensor:
         """Logits (N, 2)."""
-        if not len(candidates):
-            return candidates.base_xy_m.new_zeros((0, 2))
         return self.score_tokens(self.encode(clouds, robots), clouds, candidates, robots)
 
     def encode(self, clouds: Clouds[Tensor], robots: RobotInputs[Tensor]) -> Tokens:

@@ -102,15 +102,15 @@ def read_footprint(given: str | float | Sequence[Sequence[float]] | Footprint) -
     return circle_footprint(rows[0][0]) if len(rows) == 1 and len(rows[0]) == 1 else polygon_footprint(rows)
 
 
-def circle_footprint(radius_m: float, place: str = "--footprint") -> Footprint:
+def circle_footprint(radius_m: float) -> Footprint:
     """The circle of a radius. InputError where the radius is out of range."""
     if not _SMALLEST_M <= radius_m <= _LARGEST_M:
         problem = f"has no radius from {_SMALLEST_M:g} to {_LARGEST_M:g} m"
-        raise InputError(place, f"{radius_m:g}", problem, _FIX)
+        raise InputError("--footprint", f"{radius_m:g}", problem, _FIX)
     return Footprint(float(radius_m))
 
 
-def polygon_footprint(corners_m: Sequence[Sequence[float]], place: str = "--footprint") -> Footprint:
+def polygon_footprint(corners_m: Sequence[Sequence[float]]) -> Footprint:
     """The polygon with these corners (x, y), in order. InputError where they outline no base."""
     try:
         corners: F64 = np.array([[float(c) for c in corner] for corner in corners_m], np.float64)
@@ -118,15 +118,15 @@ def polygon_footprint(corners_m: Sequence[Sequence[float]], place: str = "--foot
         corners = np.zeros((0, 2))
     if corners.ndim != 2 or corners.shape[1] != 2 or not 3 <= len(corners) <= _MOST_CORNERS:
         problem = f"is not 3 to {_MOST_CORNERS} corners of x and y"
-        raise InputError(place, "", problem, _FIX)
+        raise InputError("--footprint", "", problem, _FIX)
     far_m = np.abs(corners).max()
     if not (np.isfinite(corners).all() and far_m <= _LARGEST_M):
-        raise InputError(place, "", f"has a corner farther than {_LARGEST_M:g} m", _FIX)
+        raise InputError("--footprint", "", f"has a corner farther than {_LARGEST_M:g} m", _FIX)
     wide_m = corners.max(axis=0) - corners.min(axis=0)
     if wide_m.min() < 2 * _SMALLEST_M or crosses_itself(corners):
-        raise InputError(place, "", "crosses itself or has no area", _FIX)
+        raise InputError("--footprint", "", "crosses itself or has no area", _FIX)
     if not inside_polygon(np.zeros((1, 2)), corners)[0]:
         fix = "Give corners around the arm's mount: its axis is the origin, x to the front"
-        raise InputError(place, "", "does not hold the arm's mount", fix)
+        raise InputError("--footprint", "", "does not hold the arm's mount", fix)
     radius_m = float(np.linalg.norm(corners, axis=1).max())
     return Footprint(radius_m, tuple((x, y) for x, y in corners.tolist()))

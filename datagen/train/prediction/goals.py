@@ -79,7 +79,7 @@ def _base(p: Prediction) -> tuple[str, F64]:
     # Imported here: reads the robot's URDF.
     from datagen.workers.robots.assembly import assemble
 
-    return base, inverse(assemble(robot_source(name), None).T_root_mount)
+    return base, inverse(assemble(robot_source(name), None).base.T_root_mount)
 
 
 def _pose(p: Prediction, row: int, T_mount_base: F64) -> dict[str, dict[str, float]]:

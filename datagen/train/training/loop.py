@@ -71,7 +71,7 @@ class Training:
 def run_training(
     training: Training,
     save: Callable[[], None],
-    callbacks: Sequence[TrainingCallback] = (),
+    callbacks: Sequence[TrainingProgress] = (),
     stopping: Callable[[], bool] = lambda: False,
     save_every_s: float = 300.0,
 ) -> bool:
@@ -87,7 +87,7 @@ def run_training(
         while not at.finished:
             wait_began_s = time.perf_counter()
             for batch in training.train.epoch(at.epoch, at.batch):
-                clock.waited_from(wait_began_s)
+                clock.wait_s += time.perf_counter() - wait_began_s
                 stop = stopping()
                 step = _step(training, batch, clock)
                 for callback in callbacks:
@@ -124,7 +124,8 @@ def _repeatable(device: torch.device) -> Generator[None]:
 def _step(training: Training, batch: Batch[Array], clock: _Clock) -> TrainingStep:
     """Take a step on a batch. InputError at a loss or gradient that is not finite."""
     options, at, device = training.options, training.position, training.model.device
-    torch.manual_seed(_seed(options.seed, at.epoch, at.batch, 0))
+    seed = np.random.SeedSequence([_STEP_STREAM, options.seed, at.epoch, at.batch, 0])
+    torch.manual_seed(int(seed.generate_state(1, np.uint64)[0]))
     given = to_torch(batch, device)
     with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
         logits = training.model(given.clouds, given.candidates, given.robots)
@@ -188,10 +189,6 @@ def _refuse(quantity: str, at: Position, batch: Batch[Array], bad: Tensor) -> No
     )
 
 
-def _seed(*numbers: int) -> int:
-    return int(np.random.SeedSequence([_STEP_STREAM, *numbers]).generate_state(1, np.uint64)[0])
-
-
 def _add_cost(at: Position, wall_s: float, cpu_s: float, wait_s: float) -> None:
     for name, value in (("train_wall_s", wall_s), ("train_cpu_s", cpu_s), ("data_wait_s", wait_s)):
         at.cost[name] = at.cost.get(name, 0.0) + value
@@ -201,15 +198,12 @@ class _Clock:
     """Wall and CPU seconds of this process since the last lap, and how many it waited for batches."""
 
     def __init__(self) -> None:
-        self._wall_s, self._cpu_s, self._wait_s = time.perf_counter(), time.process_time(), 0.0
-
-    def waited_from(self, began_s: float) -> None:
-        self._wait_s += time.perf_counter() - began_s
+        self._wall_s, self._cpu_s, self.wait_s = time.perf_counter(), time.process_time(), 0.0
 
     def lap(self) -> tuple[float, float, float]:
         """Wall, CPU and waiting seconds since the last lap."""
-        wall_s, cpu_s, wait_s = self._wall_s, self._cpu_s, self._wait_s
-        self._wall_s, self._cpu_s, self._wait_s = time.perf_counter(), time.process_time(), 0.0
+        wall_s, cpu_s, wait_s = self._wall_s, self._cpu_s, self.wait_s
+        self._wall_s, self._cpu_s, self.wait_s = time.perf_counter(), time.process_time(), 0.0
         return self._wall_s - wall_s, self._cpu_s - cpu_s, wait_s
 
 
@@ -278,16 +272,6 @@ class TrainingStep:
     step_s: float  # for the whole step
 
 
-class TrainingCallback(Protocol):
-    """Called after each step and each epoch."""
-
-    def step(self, step: TrainingStep) -> None: ...
-
-    def epoch(self, record: dict[str, Any]) -> None:
-        """A row of the history: epoch, loss, val_loss, val_accuracy, val_balanced_accuracy, val_auc, best."""
-        ...
-
-
 class TrainingProgress:
     """Progress of the training to `place`: loss, speed, time left, the loader's share; a row per epoch."""
 
@@ -297,12 +281,14 @@ class TrainingProgress:
         self._pace = Pace(lambda: self._spent_s)
 
     def step(self, step: TrainingStep) -> None:
+        """Called after each step."""
         self._spent_s, self._steps = self._spent_s + step.step_s, self._steps + 1
         self._samples, self._waited_s = self._samples + step.samples, self._waited_s + step.wait_s
         self._pace.see(self._samples, self._waited_s, self._steps)
         self._shown.update("steps", step.step, step.steps, lambda: self._figures(step))
 
     def epoch(self, record: dict[str, Any]) -> None:
+        """Called after each epoch with its row of the history, and whether it is the `best`."""
         numbers = "".join(
             f"  {name} {record[field]:.4f}"
             for name, field in (("balanced", "val_balanced_accuracy"), ("AUC", "val_auc"))

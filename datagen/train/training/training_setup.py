@@ -94,7 +94,10 @@ def prepare_training(job: TrainingJob, seen: Seen | None = None) -> tuple[Traini
     train, val = _streams(job)
     refuse_one_class(train)
     if began is not None:
-        _refuse_known_houses(job, began.head, val)
+        known = sorted(val.house_ids() & set(began.head.house_ids))
+        if known:
+            problem = f"{known[0]!r} is in the training data of --init ({len(known)} such houses)"
+            raise InputError(job.init or "", "house_id", problem, "Name runs of other houses with --val")
     class_weights = _class_weights(train, stage.weighted)
     model = _model(job, began)
     batches = (train, val) if job.encoded is None else _encoded(job, model, (train, val), seen)
@@ -212,13 +215,6 @@ def _refuse_other_labels(stage: str, stream: SampleStream) -> None:
             fitting = " or ".join(name for name, other in STAGES.items() if source in other.label_sources)
             problem = f"is {source}, but {stage} trains on {' or '.join(wanted)} labels"
             raise InputError(summary.part.place, "label_source", problem, f"Use it for {fitting}")
-
-
-def _refuse_known_houses(job: TrainingJob, began: CheckpointHead, val: SampleStream) -> None:
-    known = sorted(val.house_ids() & set(began.house_ids))
-    if known:
-        problem = f"{known[0]!r} is in the training data of --init ({len(known)} such houses)"
-        raise InputError(job.init or "", "house_id", problem, "Name runs of other houses with --val")
 
 
 def _class_weights(train: SampleStream, weighted: bool) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -12,12 +12,15 @@ from datagen.schemas.fields import facing_rad
 from datagen.schemas.specification import CandidateParams, Range
 from datagen.workers.bases.clearance import (
     Footprint,
+    HouseObstacles,
     ObstacleDistances,
-    Surroundings,
     base_clearance_m,
     distances_from_obstacles,
 )
 from datagen.workers.geometry.mesh import F32, F64
+
+if TYPE_CHECKING:  # it needs the compiler
+    from datagen.workers.motion.reachable_set import ReachableSet
 
 Bools = npt.NDArray[np.bool_]
 
@@ -25,19 +28,6 @@ Bools = npt.NDArray[np.bool_]
 ROUNDS = 8
 # Robots sampled per robot that a scene needs, before the scene is rejected.
 DRAWS_A_ROBOT = 16
-
-
-class Reach(Protocol):
-    """Where a hand gets; `ReachableSet` is one."""
-
-    @property
-    def farthest_m(self) -> float:
-        """Horizontal distance from the mount beyond which no position is reached."""
-        ...
-
-    def holds(self, positions_base_m: F64) -> Bools:
-        """Whether the hand gets to positions (N, 3) in the base frame: the mount, x to the front."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +84,10 @@ def footprint_of(params: CandidateParams) -> Footprint | None:
 
 def draw_candidates(
     target_center_m: F64,
-    obstacles: Surroundings,
+    obstacles: HouseObstacles,
     params: CandidateParams,
     rng: np.random.Generator,
-    reach: Reach | None = None,
+    reach: ReachableSet | None = None,
 ) -> SceneCandidates | None:
     """Return all cells of the grid, or `per_scene` positions jittered within cells, with their robots.
 
@@ -195,7 +185,7 @@ def _with_clearance(
     yaw_rad: F32,
     robot_index: npt.NDArray[np.int16],
     robots: _SceneRobots,
-    obstacles: Surroundings,
+    obstacles: HouseObstacles,
     params: CandidateParams,
 ) -> SceneCandidates:
     """SceneCandidates of robots at positions (N, 2) and headings (N,), world, with their clearance."""
@@ -215,10 +205,10 @@ class _Rounds:
     def __init__(
         self,
         target_center_m: F64,
-        obstacles: Surroundings,
+        obstacles: HouseObstacles,
         params: CandidateParams,
         rng: np.random.Generator,
-        reach: Reach | None,
+        reach: ReachableSet | None,
     ) -> None:
         cells = grid_offsets(params)
         self._target_m, self._params = target_center_m, params

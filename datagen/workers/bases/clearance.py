@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -30,27 +29,12 @@ _PAIRS = 4096  # of bases and obstacles, likewise
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Floor plan of a house: one convex footprint per body part, with its height range."""
+    """Part of a house's floor plan: one convex footprint per body part, with its height range."""
 
     polygons_m: F64  # (P, K, 2), counter-clockwise, padded by repeating the last corner
     low_m: F64  # (P,)
     high_m: F64  # (P,)
     floors_m: tuple[F64, ...]  # room polygons
-
-    def near(self, xy_m: F64, highest_m: float, around_m: float) -> Obstacles:
-        """Those that begin below `highest_m` and may be within `around_m` of positions (N, 2)."""
-        near = (self.polygons_m.max(1) > xy_m.min(0) - around_m).all(1)
-        near &= (self.polygons_m.min(1) < xy_m.max(0) + around_m).all(1)
-        near &= self.low_m < highest_m
-        return Obstacles(self.polygons_m[near], self.low_m[near], self.high_m[near], self.floors_m)
-
-
-class Surroundings(Protocol):
-    """Obstacles, or what gives those near positions."""
-
-    def near(self, xy_m: F64, highest_m: float, around_m: float) -> Obstacles:
-        """As `Obstacles.near`."""
-        ...
 
 
 class HouseObstacles:
@@ -62,7 +46,7 @@ class HouseObstacles:
         self._low_m, self._high_m = (corners_m.astype(np.float64) for corners_m in house.part_boxes_m)
 
     def near(self, xy_m: F64, highest_m: float, around_m: float) -> Obstacles:
-        """As `Obstacles.near`."""
+        """Those that begin below `highest_m` and may be within `around_m` of positions (N, 2)."""
         low_m, high_m, known = self._low_m, self._high_m, self._footprints
         near = (high_m[:, :2] > xy_m.min(0) - around_m).all(1) & (high_m[:, 2] > STEP_M)
         near &= (low_m[:, :2] < xy_m.max(0) + around_m).all(1) & (low_m[:, 2] < highest_m)
@@ -72,11 +56,6 @@ class HouseObstacles:
                 known[k] = convex_hull(self._parts_m[k][:, :2])
         polygons_m = stack_polygons([known[k] for k in rows.tolist()])
         return Obstacles(polygons_m, low_m[rows, 2], high_m[rows, 2], self._floors_m)
-
-
-def obstacles_of(house: House) -> Obstacles:
-    """All obstacles of a house."""
-    return HouseObstacles(house).near(np.zeros((1, 2)), np.inf, np.inf)
 
 
 class Footprint:
@@ -188,7 +167,7 @@ def base_clearance_m(
     base_height_m: F32,
     camera_height_m: F32,
     base_radius_m: F64,
-    obstacles: Surroundings,
+    obstacles: HouseObstacles,
     mast_radius_m: float,
     footprint: Footprint | None = None,
     yaw_rad: F32 | None = None,

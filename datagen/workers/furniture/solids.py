@@ -147,7 +147,18 @@ def placed(mesh: Mesh, parts_m: tuple[F32, ...], T_world_local: F64) -> tuple[Me
     return moved, tuple(out)
 
 
-_BY_WORD: tuple[tuple[str, Rgb], ...] = (
+_BY_WORD: tuple[tuple[str, Rgb], ...] = (  # the first that a name contains
+    ("yellow", (222, 196, 120)),
+    ("orange", (210, 150, 96)),
+    ("brown", (130, 94, 66)),
+    ("grey", (140, 140, 140)),
+    ("gray", (140, 140, 140)),
+    ("blue", (120, 146, 178)),
+    ("green", (132, 158, 124)),
+    ("red", (166, 84, 74)),
+    ("black", (52, 50, 50)),
+    ("white", (228, 226, 220)),
+    ("tan", (204, 178, 144)),
     ("brick", (150, 84, 66)),
     ("wood", (164, 122, 82)),
     ("parquet", (158, 112, 70)),
@@ -164,19 +175,6 @@ _BY_WORD: tuple[tuple[str, Rgb], ...] = (
     ("drywall", (214, 206, 194)),
     ("eggshell", (230, 224, 208)),
     ("metal", (168, 170, 174)),
-)
-_TINTS: tuple[tuple[str, Rgb], ...] = (
-    ("yellow", (222, 196, 120)),
-    ("orange", (210, 150, 96)),
-    ("brown", (130, 94, 66)),
-    ("grey", (140, 140, 140)),
-    ("gray", (140, 140, 140)),
-    ("blue", (120, 146, 178)),
-    ("green", (132, 158, 124)),
-    ("red", (166, 84, 74)),
-    ("black", (52, 50, 50)),
-    ("white", (228, 226, 220)),
-    ("tan", (204, 178, 144)),
 )
 _FLOORS: tuple[Rgb, ...] = (
     (164, 122, 82), (140, 98, 62), (186, 150, 110), (176, 172, 164), (120, 108, 98), (150, 134, 118),
@@ -220,8 +218,7 @@ def material_rgb(material: JsonNode | None, of_floor: bool) -> Rgb:
 def named_rgb(name: str, of_floor: bool) -> Rgb:
     """The colour that a material's name suggests, else one of a palette, stable for the name."""
     lower = name.lower()
-    for words in (_TINTS, _BY_WORD):
-        for word, rgb in words:
-            if word in lower:
-                return pick((rgb,), name)
+    for word, rgb in _BY_WORD:
+        if word in lower:
+            return pick((rgb,), name)
     return pick(_FLOORS if of_floor else _WALLS, name)

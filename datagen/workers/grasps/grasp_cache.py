@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -84,9 +84,41 @@ class ScoredGrasps:
 class _Known:
     """Grasps of one object by one hand that this process has loaded or computed."""
 
+    digest: str
+    model: ObjectModel
+    gripper: Gripper
     searches: list[HandPoses] = field(default_factory=list)
     scores: dict[tuple[int, int], F32] = field(default_factory=dict)  # by search and block
     sets: dict[tuple[int, float], GraspSet] = field(default_factory=dict)  # by number and least score
+
+    def poses(self, n: int) -> Iterator[tuple[int, HandPoses, int]]:
+        """The searches that find the first n poses: number, all poses, and how many of them to take."""
+        for search in range(_MOST_SEARCHES):
+            if search == len(self.searches):
+                key = file_digest([self.digest, search])
+                stored = _POSES.load(key)
+                if stored is None:
+                    rng = _generator([self.digest, search])
+                    stored = vars(hand_poses_of(self.model, self.gripper, rng))
+                    _POSES.store(key, stored)
+                self.searches.append(HandPoses(**stored))
+            poses = self.searches[search]
+            yield search, poses, min(n, len(poses))
+            n -= min(n, len(poses))
+            if n == 0 or len(poses) == 0:
+                return
+
+    def score(self, search: int, block: int) -> F32:
+        """Scores of a block of poses of a search."""
+        if (search, block) not in self.scores:
+            key = file_digest([self.digest, search, block])
+            stored = _SCORES.load(key)
+            if stored is None:
+                rng = _generator([self.digest, search, block])
+                score = score_block(self.model, self.gripper, self.searches[search], block, rng)
+                _SCORES.store(key, stored := {"score": score})
+            self.scores[search, block] = stored["score"]
+        return self.scores[search, block]
 
 
 _kept: OrderedDict[str, _Known] = OrderedDict()
@@ -102,8 +134,7 @@ def grasps_of(model: ObjectModel, gripper: Gripper, params: GraspParams, draw: i
     content gives equal bits in every process and order. Empty where the object cannot be grasped. `draw`
     seeds all random numbers.
     """
-    digest = content_digest(model, gripper, draw)
-    known, key = _known(digest), (params.per_object, params.min_score)
+    known, key = _known(model, gripper, draw), (params.per_object, params.min_score)
     if key in known.sets:
         return known.sets[key]
     first = scored_grasps(model, gripper, min(params.per_object, SCORED_FIRST), draw)
@@ -111,25 +142,20 @@ def grasps_of(model: ObjectModel, gripper: Gripper, params: GraspParams, draw: i
     rows = order[first.score[order] >= params.min_score]
     T, openings = [first.T_object_tcp[rows]], [first.opening_m[rows]]
     later: list[tuple[int, int]] = []  # search and row of each
-    left = params.per_object if len(rows) else 0
     skip = len(first)
-    for search in range(_MOST_SEARCHES if left else 0):
-        poses = _poses(known, digest, model, gripper, search)
-        some = min(left, len(poses))
+    for search, poses, some in known.poses(params.per_object) if len(rows) else ():
         begin = min(skip, some)
         T.append(poses.T_object_tcp[begin:some])
         openings.append(poses.opening_m[begin:some].astype(np.float32))
         later += [(search, row) for row in range(begin, some)]
-        left, skip = left - some, skip - begin
-        if left == 0 or len(poses) == 0:
-            break
+        skip -= begin
 
     def later_score(k: int) -> float:
         search, row = later[k]
-        return float(_score(known, digest, model, gripper, search, row // BLOCK)[row % BLOCK])
+        return float(known.score(search, row // BLOCK)[row % BLOCK])
 
     def pose_score(T_object_tcp: F64, opening_m: float) -> float:
-        rng = _generator([digest, T_object_tcp.tolist(), opening_m])
+        rng = _generator([known.digest, T_object_tcp.tolist(), opening_m])
         return float(score_poses(model, gripper, T_object_tcp[None], np.array([opening_m]), rng)[0])
 
     found = GraspSet(
@@ -150,22 +176,15 @@ def scored_grasps(model: ObjectModel, gripper: Gripper, n: int, draw: int = 0) -
     A larger `n` extends the list of a smaller one. Poses and scores come from memory, from the cache folder,
     or are computed and then cached. A broken or read-only cache costs time and changes no result.
     """
-    digest = content_digest(model, gripper, draw)
-    known = _known(digest)
+    known = _known(model, gripper, draw)
     T, openings, clear, scores = [np.zeros((0, 4, 4))], [np.zeros(0)], [np.zeros(0, bool)], [_NO_SCORE]
-    left = n
-    for search in range(_MOST_SEARCHES):
-        poses = _poses(known, digest, model, gripper, search)
-        some = min(left, len(poses))
+    for search, poses, some in known.poses(n):
         for block in range(-(-some // BLOCK)):
             rows = min(BLOCK, some - block * BLOCK)
-            scores.append(_score(known, digest, model, gripper, search, block)[:rows])
+            scores.append(known.score(search, block)[:rows])
         T.append(poses.T_object_tcp[:some])
         openings.append(poses.opening_m[:some])
         clear.append(poses.is_clear[:some])
-        left -= some
-        if left == 0 or len(poses) == 0:
-            break
     return ScoredGrasps(
         np.concatenate(T),
         np.concatenate(openings).astype(np.float32),
@@ -191,36 +210,13 @@ def content_digest(model: ObjectModel, gripper: Gripper, draw: int = 0) -> str:
     )
 
 
-def _known(digest: str) -> _Known:
-    known = _kept.setdefault(digest, _Known())
+def _known(model: ObjectModel, gripper: Gripper, draw: int) -> _Known:
+    digest = content_digest(model, gripper, draw)
+    known = _kept.setdefault(digest, _Known(digest, model, gripper))
     _kept.move_to_end(digest)
     if len(_kept) > _KEPT_IN_MEMORY:
         _kept.popitem(last=False)
     return known
-
-
-def _poses(known: _Known, digest: str, model: ObjectModel, gripper: Gripper, search: int) -> HandPoses:
-    if search == len(known.searches):
-        key = file_digest([digest, search])
-        stored = _POSES.load(key)
-        if stored is None:
-            stored = vars(hand_poses_of(model, gripper, _generator([digest, search])))
-            _POSES.store(key, stored)
-        known.searches.append(HandPoses(**stored))
-    return known.searches[search]
-
-
-def _score(known: _Known, digest: str, model: ObjectModel, gripper: Gripper, search: int, block: int) -> F32:
-    if (search, block) not in known.scores:
-        poses = known.searches[search]
-        key = file_digest([digest, search, block])
-        stored = _SCORES.load(key)
-        if stored is None:
-            rng = _generator([digest, search, block])
-            stored = {"score": score_block(model, gripper, poses, block, rng)}
-            _SCORES.store(key, stored)
-        known.scores[search, block] = stored["score"]
-    return known.scores[search, block]
 
 
 def _generator(key: list[Any]) -> np.random.Generator:

@@ -30,7 +30,24 @@ class HolodeckObjects:
 
     def stated_asset(self, entry: JsonNode) -> Asset | None:
         """The asset of a piece on the floor as the document describes it; None for another object."""
-        return _stated_asset(entry) if entry.get("id").text() in self.on_floor else None
+        if entry.get("id").text() not in self.on_floor:
+            return None
+        name, outline = entry.get("id").text().partition(" (")[0], entry.find("vertices")
+        height = 2 * entry.get("position").point()[1]
+        yaw = entry.get("rotation").get("y").number(-1e6, 1e6)
+        if outline is None or abs(yaw / 90 - round(yaw / 90)) > 1e-3:
+            return None
+        points_cm = [corner.numbers(2, -_FARTHEST_CM, _FARTHEST_CM) for corner in outline.items(16)]
+        if len(points_cm) < 3:
+            raise outline.error(f"has {len(points_cm)} corners")
+        width, depth = ((np.ptp(np.array(points_cm), axis=0) - _GAP_CM) / 100).tolist()
+        if round(yaw / 90) % 2:
+            width, depth = depth, width
+        if not all(_THINNEST_M <= side <= _MAX_SIZE_M for side in (width, depth, height)):
+            raise outline.error(f"is of a piece of {width:.4g} x {depth:.4g} x {height:.4g} m")
+        return Asset(
+            entry.get("assetId").text(), type_of_name(re.sub(r"-\d+$", "", name)), (width, depth, height)
+        )
 
 
 def read_holodeck(root: JsonNode, objects: list[JsonNode]) -> HolodeckObjects | None:
@@ -44,22 +61,3 @@ def read_holodeck(root: JsonNode, objects: list[JsonNode]) -> HolodeckObjects | 
         carrier = entry.get("id").text().partition("|")[2]
         (out.carried[carrier] if carrier in ids else out.furniture).append(entry)
     return out
-
-
-def _stated_asset(entry: JsonNode) -> Asset | None:
-    name, outline = entry.get("id").text().partition(" (")[0], entry.find("vertices")
-    height = 2 * entry.get("position").point()[1]
-    yaw = entry.get("rotation").get("y").number(-1e6, 1e6)
-    if outline is None or abs(yaw / 90 - round(yaw / 90)) > 1e-3:
-        return None
-    points_cm = [corner.numbers(2, -_FARTHEST_CM, _FARTHEST_CM) for corner in outline.items(16)]
-    if len(points_cm) < 3:
-        raise outline.error(f"has {len(points_cm)} corners")
-    width, depth = ((np.ptp(np.array(points_cm), axis=0) - _GAP_CM) / 100).tolist()
-    if round(yaw / 90) % 2:
-        width, depth = depth, width
-    if not all(_THINNEST_M <= side <= _MAX_SIZE_M for side in (width, depth, height)):
-        raise outline.error(f"is of a piece of {width:.4g} x {depth:.4g} x {height:.4g} m")
-    return Asset(
-        entry.get("assetId").text(), type_of_name(re.sub(r"-\d+$", "", name)), (width, depth, height)
-    )

@@ -67,7 +67,8 @@ def read_things(root: JsonNode, assets: Mapping[str, Asset], findings: Counter[s
             findings["unknown assets"] += 1
             continue  # with the objects on it, which would float
         T_asset, tilt_deg = _pose(entry, asset)
-        xy = _centre_xy(entry)
+        x, _, z = entry.get("position").point()
+        xy = np.array([x, z])
         is_upright = tilt_deg <= _UPRIGHT_DEG
         out.append(Thing(_new_id(entry, seen), "furniture", asset, T_asset, xy, is_upright))
         for child in _children(entry) if own is None else own.carried[entry.get("id").text()]:
@@ -128,11 +129,6 @@ def unity_rotation(x_deg: float, y_deg: float, z_deg: float) -> F64:
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
     about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
     return _SWAP @ about_y @ about_x @ about_z @ _SWAP
-
-
-def _centre_xy(node: JsonNode) -> F64:
-    x, _, z = node.get("position").point()
-    return np.array([x, z])
 
 
 def _is_inside(node: JsonNode, below: Asset, T_below: F64) -> bool:

@@ -1,4 +1,4 @@
-"""Labels of base poses. LABEL_SOURCES is the registry; each source lives in one file."""
+"""Labels of base poses. LABEL_SOURCES is the registry."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class LabelSource:
 
 LABEL_SOURCES: dict[str, str] = {
     "heuristic": "datagen.workers.labels.heuristic_source:HEURISTIC",
-    "plan": "datagen.workers.labels.plan_source:PLAN",
-    "sim": "datagen.workers.labels.sim_source:SIM",
+    "plan": "datagen.workers.labels.arm_sources:PLAN",
+    "sim": "datagen.workers.labels.arm_sources:SIM",
 }
 
 

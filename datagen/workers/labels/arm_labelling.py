@@ -148,42 +148,16 @@ def try_candidate(
     with clock.stage("plan"):
         report = plan_candidate(planning, T_world_base, rng)
     disturbances = disturbances_of(at, index, spec)
-    if at.arm.trial is None:
-        return _plan_arrivals(at, T_world_base, report, disturbances, candidates, row, spec, rng)
-    if report.plan is None:
+    arrived = [T_world_base @ d.T_base_moved for d in disturbances]
+    fits = fits_at(at, arrived, candidates, row, spec) if arrived else np.empty(0, np.bool_)
+    if at.arm.trial is not None and report.plan is None:
         return CandidateTrial(report.outcome, report)
     if disturbances:
-        fits = fits_at(at, [T_world_base @ d.T_base_moved for d in disturbances], candidates, row, spec)
-        return _repeat(at, T_world_base, report, disturbances, fits, rng, record)
+        return _arrive(at, T_world_base, report, disturbances, fits, rng, record)
+    if at.arm.trial is None or report.plan is None:
+        has_plan = int(report.plan is not None)
+        return CandidateTrial(report.outcome, report, report.plan, successes=has_plan, trials=1)
     return _attempt(at, T_world_base, report, report.plan, rng, record)
-
-
-def _plan_arrivals(
-    at: ArmInScene,
-    T_world_base: F64,
-    report: PlanReport,
-    disturbances: list[Disturbance],
-    candidates: SceneCandidates,
-    row: int,
-    spec: Specification,
-    rng: np.random.Generator,
-) -> CandidateTrial:
-    """Plan again from the arrival pose of each disturbance; the label stays that of the candidate.
-
-    This includes candidates without a plan: a robot that arrives near one may succeed.
-    """
-    if not disturbances:
-        return CandidateTrial(
-            report.outcome, report, report.plan, successes=int(report.plan is not None), trials=1
-        )
-    fits = fits_at(at, [T_world_base @ d.T_base_moved for d in disturbances], candidates, row, spec)
-    successes = 0
-    with at.clock.stage("plan"):
-        for disturbance, does_fit in zip(disturbances, fits.tolist(), strict=True):
-            if does_fit:
-                found = plan_candidate(at.planning, T_world_base @ disturbance.T_base_moved, rng)
-                successes += found.plan is not None
-    return CandidateTrial(report.outcome, report, report.plan, successes=successes, trials=len(disturbances))
 
 
 def _attempt(
@@ -219,7 +193,7 @@ def _attempt(
     return CandidateTrial(outcome, report, plan, tuple(results), bases, successes, 1, retry_outcome)
 
 
-def _repeat(
+def _arrive(
     at: ArmInScene,
     T_world_base: F64,
     report: PlanReport,
@@ -228,12 +202,13 @@ def _repeat(
     rng: np.random.Generator,
     record: bool,
 ) -> CandidateTrial:
-    """Plan and execute from the arrival pose of each disturbance; positive where at least half succeed.
+    """Plan, and where there are trials execute, from the arrival pose of each disturbance.
 
     The robot knows its arrival pose, but not the other disturbances. Where `fits` (K,) is false, its body
-    collides.
+    collides. With trials the label is positive where at least half succeed. Without, it is that of the
+    candidate, also of one without a plan: a robot that arrives near one may succeed.
     """
-    planning, trials, clock = at.planning, at.trials, at.clock
+    planning, trials = at.planning, None if at.arm.trial is None else at.trials
     results: list[TrialResult] = []
     bases: list[F64] = []
     ends: list[str] = []
@@ -242,20 +217,20 @@ def _repeat(
         if not does_fit:
             ends.append("base_collision")
             continue
-        with clock.stage("plan"):
+        with at.clock.stage("plan"):
             found = plan_candidate(planning, T_arrived, rng)
-        if found.plan is None:
+        if found.plan is None or trials is None:
             ends.append(found.outcome)
             continue
-        with clock.stage("execute"):
+        with at.clock.stage("execute"):
             unknown = replace(disturbance, T_base_moved=np.eye(4))
             results.append(run_trial(trials, T_arrived, found.plan, unknown, record))
         bases.append(T_arrived)
         ends.append(results[-1].outcome)
-    successes = ends.count("success")
-    if 2 * successes >= len(ends):
+    successes, outcome = ends.count("success"), report.outcome
+    if trials is not None and 2 * successes >= len(ends):
         outcome = "success"
-    else:
+    elif trials is not None:
         counts = Counter(end for end in ends if end != "success")
         outcome = max(counts, key=lambda name: (counts[name], _PROGRESS.index(name)))
     return CandidateTrial(outcome, report, report.plan, tuple(results), tuple(bases), successes, len(ends))

@@ -26,7 +26,7 @@ def visibility_score(rho: F64) -> F64:
 
 
 def effective_distance(
-    distance_m: F32, mount_distance_m: F32, arm_reach_m: F32, params: HeuristicParams
+    distance_m: F32 | F64, mount_distance_m: F32 | F64, arm_reach_m: F32 | F64, params: HeuristicParams
 ) -> F64:
     """The distance that the score is a function of: the paper's planar one, or a reach-relative one."""
     match params.distance:

@@ -61,25 +61,15 @@ def robot_limits(name: str) -> RobotLimits:
     keys, base = source.keys, source.keys.base
     if keys.scaled is not None:
         return RobotLimits(keys.scaled.reach_m, None, None)
-    reach_m, stands = (keys.reach_m or 0.0, keys.reach_m or 0.0), (base.presents, base.yaw_rad)
-    if base.pedestal and keys.reach_m is not None:
-        return RobotLimits(reach_m, None, None, None, *stands)
-    if (
-        keys.reach_m is not None
-        and base.height_m is not None
-        and (radius_m := base.outer_radius_m) is not None
-    ):
-        return RobotLimits(reach_m, (base.height_m, base.height_m), radius_m, base.footprint_m, *stands)
-    return _limits(source)
-
-
-@lru_cache(maxsize=64)
-def _limits(source: RobotSource) -> RobotLimits:
-    robot = _built(source, None)
-    reach_m, base = source.keys.reach_m or math.ceil(1000 * robot.reach_m) / 1000, robot.base
-    stands = source.keys.base.presents, source.keys.base.yaw_rad
-    height_m = None if base.height_m is None else (base.height_m, base.height_m)
-    return RobotLimits((reach_m, reach_m), height_m, base.radius_m, base.footprint_m, *stands)
+    reach_m, height_m, radius_m, outline = keys.reach_m, base.height_m, base.outer_radius_m, base.footprint_m
+    if base.pedestal and reach_m is not None:
+        height_m = radius_m = outline = None
+    elif reach_m is None or height_m is None or radius_m is None:
+        robot = _built(source, None)
+        reach_m = reach_m or math.ceil(1000 * robot.reach_m) / 1000
+        height_m, radius_m, outline = robot.base.height_m, robot.base.radius_m, robot.base.footprint_m
+    heights_m = None if height_m is None else (height_m, height_m)
+    return RobotLimits((reach_m, reach_m), heights_m, radius_m, outline, base.presents, base.yaw_rad)
 
 
 def open_robot(name: str, reach_m: float | None, base_height_m: float) -> Robot:

@@ -23,7 +23,11 @@ TURN = "base_turn"  # the joint of a base that turns in place
 
 
 class ArmChain:
-    """The joints between base and tip, and the links that are fixed to each of them."""
+    """The joints between base and tip, and the links that are fixed to each of them.
+
+    Joint j of J stands at `ratio[j] * q[coordinate[j]] + offset[j]` for A coordinates q. They have names
+    (`coordinates`), limits, speeds in radians or metres a second, and may be lengths (`slides`).
+    """
 
     def __init__(self, source: RobotSource, tree: UrdfTree, palm: str) -> None:
         keys = source.keys

@@ -12,7 +12,7 @@ from datagen.schemas.identity import digest_of
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import inverse
-from datagen.workers.kinematics.tree import Bools, Ints, KinematicTree
+from datagen.workers.kinematics.tree import KinematicTree
 from datagen.workers.robots.arm_chain import TURN, ArmChain
 from datagen.workers.robots.base import Base, base_of
 from datagen.workers.robots.hand import Hand, hand_of
@@ -34,28 +34,17 @@ _MOST_BYTES = 64 << 20
 
 @dataclass(frozen=True, eq=False)
 class Assembly:
-    """Bodies 0 (root), 1..J (arm), then the palm and the fingers. Joint k moves body k + 1.
-
-    Joint j stands at `ratio[j] * q[coordinate[j]] + offset[j]`; A coordinates.
-    """
+    """Bodies 0 (root), 1..J (arm), then the palm and the fingers. Joint k moves body k + 1."""
 
     bodies: tuple[LinkBody, ...]
     arm: tuple[Joint, ...]  # (J,), with scaled origins; names of parent and child are those of bodies
     palm: Joint
     hand: Hand
     base: Base
-    T_root_mount: F64  # (4, 4)
-    names: tuple[str, ...]  # (A,) of the coordinates
-    coordinate: Ints  # (J,)
-    ratio: F64  # (J,)
-    offset: F64  # (J,)
-    lower: F64  # (A,)
-    upper: F64  # (A,)
-    speed: F64  # (A,), radians or metres a second
-    slides: Bools  # (A,)
+    chain: ArmChain  # how the coordinates move the joints
+    scale: float
     shoulder_m: F64  # (3,), base frame: where the reach is measured from
     reach_m: float
-    scale: float
 
     @property
     def hand_placements(self) -> list[F64]:
@@ -70,7 +59,7 @@ class Assembly:
     def tree(self) -> KinematicTree:
         """All joints, and a frame for every body, fingers open, and for the TCP."""
         J = len(self.arm)
-        T_base_root = inverse(self.T_root_mount)
+        T_base_root, chain = inverse(self.base.T_root_mount), self.chain
         joints = [joint.T_parent_child for joint in self.arm]
         hand = self.hand_placements
         return KinematicTree(
@@ -78,11 +67,11 @@ class Assembly:
             np.stack([T_base_root @ joints[0], *joints[1:]]),
             np.stack([joint.axis for joint in self.arm]),
             np.array([joint.kind == "prismatic" for joint in self.arm]),
-            self.coordinate,
-            self.ratio,
-            self.offset,
-            self.lower,
-            self.upper,
+            chain.coordinate,
+            chain.ratio,
+            chain.offset,
+            chain.lower,
+            chain.upper,
             np.array([-1, *range(J), *[J - 1] * (len(hand) + 1)]),
             np.stack([T_base_root, *[np.eye(4)] * J, *hand, hand[0] @ self.hand.T_palm_tcp]),
         )
@@ -162,21 +151,16 @@ def assemble(source: RobotSource, reach_m: float | None) -> Assembly:
     mount = Joint(
         "hand_mount", "fixed", arm.names[-1], hand.bodies[0].name, T_palm, no_axis, 0.0, 0.0, 0.0, 0.0
     )
-    found = Assembly(
-        (*bodies, *hand.bodies), joints, mount, hand, base, base.T_root_mount, arm.coordinates,
-        arm.coordinate, arm.ratio, arm.offset, arm.lower, arm.upper, arm.speed, arm.slides,
-        np.zeros(3), 0.0, scale,
-    )  # fmt: skip
-    return _with_reach(source, found, arm, hand)
+    found = Assembly((*bodies, *hand.bodies), joints, mount, hand, base, arm, scale, np.zeros(3), 0.0)
+    return _with_reach(source, found)
 
 
-def _with_reach(source: RobotSource, found: Assembly, arm: ArmChain, hand: Hand) -> Assembly:
+def _with_reach(source: RobotSource, found: Assembly) -> Assembly:
     """With the shoulder and the largest distances from it."""
-    T_base_root, plain = inverse(found.T_root_mount), not found.slides.any() and not arm.turns
-    if plain and len(found.names) == len(found.arm):
-        chain = arm.chain(found.arm, found.palm.T_parent_child, hand)
+    arm, T_base_root = found.chain, inverse(found.base.T_root_mount)
+    if not arm.slides.any() and not arm.turns and len(arm.coordinates) == len(found.arm):
         shoulder_m = (T_base_root @ found.arm[0].T_parent_child)[:3, 3]
-        reach_m = largest_reach_m(chain)
+        reach_m = largest_reach_m(arm.chain(found.arm, found.palm.T_parent_child, found.hand))
     else:
         # Lifts that come first stand in the middle of their range.
         tree = found.tree()
@@ -184,8 +168,8 @@ def _with_reach(source: RobotSource, found: Assembly, arm: ArmChain, hand: Hand)
         for j, joint in enumerate(found.arm):
             T = T @ tree.T_parent_joint[j]
             if joint.kind == "prismatic":
-                k = found.coordinate[j]
-                position = float(found.ratio[j] * (found.lower[k] + found.upper[k]) / 2 + found.offset[j])
+                k = arm.coordinate[j]
+                position = float(arm.ratio[j] * (arm.lower[k] + arm.upper[k]) / 2 + arm.offset[j])
                 T = T @ motion(joint, position)
                 shoulder_m = T[:3, 3]
             elif joint.name != TURN:

@@ -48,11 +48,6 @@ class Gripper:
     linkage: Linkage | None = None
 
     @property
-    def body_parts_m(self) -> tuple[Parts, ...]:
-        """Parts (B,) of the bodies that `body_poses` moves, TCP frame, hand closed; the palm first."""
-        return (self.palm_parts_m, *self.finger_parts_m) if self.linkage is None else self.linkage.parts_m
-
-    @property
     def side(self) -> Ints:
         """(B,) 1 and -1 for bodies on the sides of +y and -y, 0 for the palm."""
         return np.array([0, 1, -1]) if self.linkage is None else self.linkage.side

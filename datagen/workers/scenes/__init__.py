@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
 from datagen.schemas.specification import Specification
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:  # they load renderers, which a base installation lacks
     from datagen.workers.rendering import Camera
     from datagen.workers.rendering.cloud import Cloud
     from datagen.workers.rendering.embree import RayScene
+    from datagen.workers.scenes.reconstruct import ReconstructedScene
     from datagen.workers.settling import SettleResult
     from datagen.workers.world import PreparedHouse
 
@@ -33,33 +34,8 @@ def scenes_version(spec: Specification) -> int:
     return VERSION if spec.candidates.within is None else VERSION_WITHIN
 
 
-class SettledScene(Protocol):
-    """The input of a label source: a new `Scene`, or one read from a store. Object 0 is the target."""
-
-    @property
-    def index(self) -> int: ...
-
-    @property
-    def retry(self) -> int: ...
-
-    @property
-    def house(self) -> PreparedHouse: ...
-
-    @property
-    def models(self) -> tuple[ObjectModel, ...]: ...
-
-    @property
-    def T_world_object(self) -> F64:
-        """Settled poses (K, 4, 4)."""
-        ...
-
-    @property
-    def rays(self) -> RayScene: ...
-
-    @property
-    def target_center_m(self) -> F64:
-        """World position (3,) of the target's frame: the centre of its bounding box."""
-        ...
+# The input of a label source: a new scene, or one read from a store. Object 0 is the target.
+SettledScene: TypeAlias = "Scene | ReconstructedScene"
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,14 +13,14 @@ from datagen.schemas.identity import Stream, generator
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import CandidateParams, ObservationParams, SettleParams, Specification
 from datagen.workers.bases.candidates import SceneCandidates, draw_candidates
-from datagen.workers.bases.clearance import Surroundings, base_clearance_m
+from datagen.workers.bases.clearance import HouseObstacles, base_clearance_m
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.houses.house import Room, Surface
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.rendering import Camera, Frame, SceneGeometry, load_renderer
-from datagen.workers.rendering.cloud import Cloud, PixelCaster, caster_of, observe_cloud
+from datagen.workers.rendering.cloud import PixelCaster, caster_of, observe_cloud
 from datagen.workers.rendering.embree import RayScene, cast_pixels
 from datagen.workers.rendering.noise import add_noise
 from datagen.workers.rendering.visibility import visible_pixels
@@ -137,9 +138,12 @@ def _try_scene(
         camera, share = draw_viewpoint(
             rays, room, house.obstacles, target_m, spec.observation, spec.candidates, rng
         )
-        geometry = SceneGeometry(house.house, models, settled.T_world_object)
-        noise_rng = generator(spec.seed, Stream.NOISE, index, retry)
-        cloud = _observe(spec.observation, geometry, rays, camera, rng, noise_rng)
+        cast: PixelCaster = partial(cast_pixels, rays, camera)  # only the pixels that the cloud samples
+        if spec.observation.noise.enabled:  # it needs neighbouring pixels
+            geometry = SceneGeometry(house.house, models, settled.T_world_object)
+            noise_rng = generator(spec.seed, Stream.NOISE, index, retry)
+            cast = caster_of(render_frame(spec.observation, geometry, camera, noise_rng))
+        cloud = observe_cloud(cast, camera, 1, target_m, float(rays.radii_m[0]), spec.observation, rng)
     scene = Scene(index, retry, redraws, house, surface, models, settled, rays, camera, share, cloud)
     return scene, candidates
 
@@ -209,24 +213,6 @@ def render_frame(
     return add_noise(frame, params.noise, noise_rng) if params.noise.enabled else frame
 
 
-def _observe(
-    params: ObservationParams,
-    geometry: SceneGeometry,
-    rays: RayScene,
-    camera: Camera,
-    rng: np.random.Generator,
-    noise_rng: np.random.Generator,
-) -> Cloud:
-    # Without noise, which needs neighbouring pixels, only the pixels that the cloud samples are cast.
-    cast: PixelCaster = (
-        (lambda pixels: cast_pixels(rays, camera, pixels))
-        if not params.noise.enabled
-        else caster_of(render_frame(params, geometry, camera, noise_rng))
-    )
-    radius_m = float(rays.radii_m[0])
-    return observe_cloud(cast, camera, 1, geometry.T_world_object[0, :3, 3], radius_m, params, rng)
-
-
 _WINDOW_PX = 32  # rays per side to evaluate a viewpoint; coarser than for labels
 _BLOCK = 4
 
@@ -234,7 +220,7 @@ _BLOCK = 4
 def draw_viewpoint(
     rays: RayScene,
     room: Room,
-    obstacles: Surroundings,
+    obstacles: HouseObstacles,
     target_center_m: F64,
     params: ObservationParams,
     robot: CandidateParams,

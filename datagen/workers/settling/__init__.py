@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+
+import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import SettleParams
@@ -29,16 +30,31 @@ class SettleResult:
     penetration_m: float
 
 
-class Settler(Protocol):
-    """Lets objects fall onto static convex parts, in a fresh physics scene, deterministically."""
+# Lets objects fall onto static convex parts (V, 3) each, in a fresh physics scene, deterministically; parts
+# and start poses (K, 4, 4) are in the world frame.
+Settler = Callable[[Sequence[F32], Sequence[ObjectModel], F64, SettleParams], SettleResult]
 
-    def __call__(
-        self,
-        static_parts_m: Sequence[F32],  # each (V, 3), world frame
-        objects: Sequence[ObjectModel],
-        T_world_object: F64,  # (K, 4, 4), start poses
-        params: SettleParams,
-    ) -> SettleResult: ...
+_CHECK_EVERY = 5  # steps between checks of the speeds: reading them costs as much as a step
+
+
+def fall(
+    step: Callable[[], object], speeds: Callable[[], tuple[float, float]], params: SettleParams
+) -> tuple[int, bool, float]:
+    """Step until rest; return steps, whether at rest, and the largest speed at the end (m/s).
+
+    `speeds` returns the largest speed (m/s) and angular speed (rad/s) of the objects.
+    """
+    steps, resting, speed = 0, 0, np.inf
+    while steps < params.max_steps and resting < params.rest_steps:
+        for _ in range(min(_CHECK_EVERY, params.max_steps - steps)):
+            step()
+            steps += 1
+        speed, angular = speeds()
+        if not (np.isfinite(speed) and np.isfinite(angular)):
+            break
+        calm = speed < params.rest_speed_mps and angular < params.rest_angular_speed_radps
+        resting = resting + _CHECK_EVERY if calm else 0
+    return steps, resting >= params.rest_steps, speed
 
 
 SETTLERS: dict[str, str] = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,8 @@ from datagen.schemas.specification import SettleParams
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import inverse, pose, quaternion_wxyz
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.settling import SettleResult
+from datagen.workers.settling import SettleResult, fall
 
-_CHECK_EVERY = 5  # steps between checks of the speeds, as with PhysX, so that step counts agree
 _GRAVITY_MPS2 = 9.81
 # PhysX's defaults; Bullet's own would slow falls and rolls down.
 _LINEAR_DAMPING, _ANGULAR_DAMPING = 0.0, 0.05
@@ -43,7 +43,9 @@ def settle_pybullet(
             bodies, T_object_inertial = _fill(
                 world, Path(folder), static_parts_m, objects, T_world_object, params
             )
-        steps, at_rest, speed = _fall(world, bodies, params)
+        steps, at_rest, speed = fall(
+            partial(pybullet.stepSimulation, physicsClientId=world), partial(_speeds, world, bodies), params
+        )
         final = [
             _pose_of(world, body) @ inverse(T) for body, T in zip(bodies, T_object_inertial, strict=True)
         ]
@@ -135,24 +137,10 @@ def _hulls_as_obj(parts_m: Sequence[F32]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _fall(world: int, bodies: list[int], params: SettleParams) -> tuple[int, bool, float]:
-    """Step until rest; returns steps, whether at rest, and the largest speed at the end (m/s)."""
-    steps, resting = 0, 0
-    speed = angular = np.inf
-    while steps < params.max_steps and resting < params.rest_steps:
-        for _ in range(min(_CHECK_EVERY, params.max_steps - steps)):
-            pybullet.stepSimulation(physicsClientId=world)
-            steps += 1
-        velocities = np.array(
-            [pybullet.getBaseVelocity(body, physicsClientId=world) for body in bodies]
-        ).reshape(-1, 2, 3)
-        largest = np.linalg.norm(velocities, axis=2).max(0, initial=0.0)
-        speed, angular = float(largest[0]), float(largest[1])
-        if not (np.isfinite(speed) and np.isfinite(angular)):
-            break
-        calm = speed < params.rest_speed_mps and angular < params.rest_angular_speed_radps
-        resting = resting + _CHECK_EVERY if calm else 0
-    return steps, resting >= params.rest_steps, speed
+def _speeds(world: int, bodies: list[int]) -> tuple[float, float]:
+    velocities = [pybullet.getBaseVelocity(body, physicsClientId=world) for body in bodies]
+    largest = np.linalg.norm(np.array(velocities).reshape(-1, 2, 3), axis=2).max(0, initial=0.0)
+    return float(largest[0]), float(largest[1])
 
 
 def _pose_of(world: int, body: int) -> F64:

@@ -12,7 +12,7 @@ from datagen.schemas.specification import SettleParams
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import pose, quaternion_wxyz
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.settling import SettleResult
+from datagen.workers.settling import SettleResult, fall
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.
@@ -21,7 +21,6 @@ with warnings.catch_warnings():
     from sapien import physx
 
 _UNSCALED = [1.0, 1.0, 1.0]
-_CHECK_EVERY = 5  # steps between checks of the speeds: reading them costs as much as a step
 
 
 def settle_sapien(
@@ -42,24 +41,17 @@ def settle_sapien(
         for model, T in zip(objects, T_world_object, strict=True)
     ]
 
-    steps, resting = 0, 0
-    speed = angular = np.inf
-    while steps < params.max_steps and resting < params.rest_steps:
-        for _ in range(min(_CHECK_EVERY, params.max_steps - steps)):
-            scene.step()
-            steps += 1
+    def speeds() -> tuple[float, float]:
         motions = np.array([(b.linear_velocity, b.angular_velocity) for b in bodies]).reshape(-1, 2, 3)
         speed, angular = np.sqrt(np.vecdot(motions, motions)).max(0, initial=0.0).tolist()
-        if not (np.isfinite(speed) and np.isfinite(angular)):
-            break
-        calm = speed < params.rest_speed_mps and angular < params.rest_angular_speed_radps
-        resting = resting + _CHECK_EVERY if calm else 0
+        return speed, angular
 
+    steps, at_rest, speed = fall(scene.step, speeds, params)
     final = np.stack([pose_of(b) for b in bodies]) if bodies else np.zeros((0, 4, 4))
     return SettleResult(
         T_world_object=final,
         steps=steps,
-        at_rest=resting >= params.rest_steps,
+        at_rest=at_rest,
         residual_speed_mps=speed,
         penetration_m=_deepest_contact(scene),
     )

@@ -21,9 +21,7 @@ from datagen.workers.trials.drive_targets import (
 from datagen.workers.trials.physics import NEAR_M, TrialWorld
 from datagen.workers.trials.trial_scene import (
     TrialScene,
-    disturbed_things,
-    pedestal_below,
-    still_parts_near,
+    disturbed,
 )
 
 # Largest errors of a joint and of the TCP at the end of reach and approach.
@@ -70,6 +68,7 @@ def run_trial(
     paths = (plan.q_reach_rad, plan.q_approach_rad, plan.q_lift_rad)
     if not all(np.isfinite(values).all() for values in (*poses, *paths)):
         return TrialResult("unstable", 0.0, 0.0, 0.0, 0.0)
+    prepared = disturbed(prepared, disturbance)
     trial = _Trial(prepared, T_world_base @ disturbance.T_base_moved, plan, disturbance, record, whole)
     return trial.result(trial.run())
 
@@ -78,7 +77,7 @@ def run_trial(
 class _Trial:
     """A running trial. Methods that may end it return the outcome, or None."""
 
-    prepared: TrialScene
+    prepared: TrialScene  # disturbed
     T_world_base: F64  # true pose of the base
     plan: MotionPlan
     disturbance: Disturbance
@@ -104,16 +103,8 @@ class _Trial:
     def _build(self) -> None:
         prepared, plan, params = self.prepared, self.plan, self.prepared.params
         self.steps = max(1, round(params.control_period_s / params.timestep_s))
-        self.world = TrialWorld(
-            still_parts_near(prepared, self.T_world_base),
-            pedestal_below(prepared, self.T_world_base),
-            disturbed_things(prepared, self.disturbance),
-            prepared.robot,
-            prepared.articulation_at(plan.opening_m),
-            self.T_world_base,
-            self.disturbance.object_friction,
-            params,
-        )
+        friction = self.disturbance.object_friction
+        self.world = TrialWorld(prepared, self.T_world_base, plan.opening_m, friction)
         self.world.place_arm(plan.q_reach_rad[0], plan.opening_m)
         self.commanded = np.concatenate([plan.q_reach_rad[0], [plan.opening_m / 2] * 2])
         self.ticks, self.is_free, self.moments = 0, False, []
@@ -318,7 +309,7 @@ class _Trial:
         if not self.supported:
             return True
         corners_m = np.concatenate(self.prepared.parts_m[0]).astype(np.float64)
-        T_start = disturbed_things(self.prepared, self.disturbance).T_world_object[0]
+        T_start = self.prepared.T_world_object[0]
         was, now = ((corners_m @ T[2, :3] + T[2, 3]).min() for T in (T_start, self.world.T_world_object[0]))
         return bool(now - was >= RISEN_SHARE * self.rise_m)
 

@@ -27,7 +27,6 @@ from datagen.workers.robots.robot import Robot
 from datagen.workers.settling.sapien_physics import sapien_pose
 from datagen.workers.trials import Disturbance
 from datagen.workers.trials.drive_targets import (
-    ControlPeriod,
     drive_targets,
     planned_rise_m,
     pressing_target_m,
@@ -49,7 +48,7 @@ from datagen.workers.trials.physics import (
     tune_pad,
     tune_shape,
 )
-from datagen.workers.trials.trial_scene import TrialScene, disturbed_things, pedestal_below, still_parts_near
+from datagen.workers.trials.trial_scene import TrialScene, disturbed, pedestal_below, still_parts_near
 
 ENV_ID = "DatagenGrasp-v1"
 _MAX_TICKS = 1000
@@ -112,7 +111,7 @@ class DatagenGraspEnv(BaseEnv):
         ):
             fix = "Make one environment for each robot and set of parameters"
             raise InputError(ENV_ID, "tasks", "differ in robot or parameters", fix)
-        self.scripts = [_script(task) for task in self.tasks]
+        self.scripts = [drive_targets(t.plan, self.robot, self.params) for t in self.tasks]
         self.rises_m = [planned_rise_m(task.plan, self.robot) for task in self.tasks]
         kwargs = {"sim_backend": "physx_cpu", "render_backend": "none", "reconfiguration_freq": 1} | kwargs
         super().__init__(
@@ -177,7 +176,7 @@ class DatagenGraspEnv(BaseEnv):
             if pedestal_m is not None:
                 pedestal = still_body([pedestal_m], PEDESTAL, friction)
                 self._build(pedestal, "static", env, np.eye(4), "pedestal")
-            things = disturbed_things(prepared, task.disturbance)
+            things = disturbed(prepared, task.disturbance)
             rows = zip(things.parts_m, things.mass_kg, things.T_world_object, strict=True)
             for k, (parts, mass, T) in enumerate(rows):
                 body = thing_body(parts, float(mass), friction)
@@ -193,8 +192,9 @@ class DatagenGraspEnv(BaseEnv):
         return _BodyBuilder(body, kind, env, T_world_body, self.scene).build(name=f"{name}-{env}")
 
     def _root_poses(self) -> Pose:
-        T = [t.T_world_true_base @ t.prepared.articulation.T_base_root for t in self.tasks]
-        return _poses(T, self.device)
+        T = [t.T_world_true_base @ self.robot.T_base_root for t in self.tasks]
+        rows = [np.concatenate([p.p, p.q]) for p in map(sapien_pose, T)]
+        return Pose.create(torch.tensor(np.stack(rows), dtype=torch.float32, device=self.device))
 
     # -- episodes -----------------------------------------------------------------------------------
 
@@ -301,12 +301,3 @@ def execute_plans(env: DatagenGraspEnv) -> torch.Tensor:
         info = env.step(env.plan_action())[4]
         success = torch.where(ends == step + 1, info["success"], success)
     return success
-
-
-def _script(task: GraspTask) -> list[ControlPeriod]:
-    return drive_targets(task.plan, task.prepared.robot, task.prepared.params)
-
-
-def _poses(T: Sequence[F64], device: torch.device) -> Pose:
-    rows = [np.concatenate([p.p, p.q]) for p in map(sapien_pose, T)]
-    return Pose.create(torch.tensor(np.stack(rows), dtype=torch.float32, device=device))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from datagen.workers.settling.sapien_physics import (
     static_body,
 )
 from datagen.workers.trials.drive_targets import FINGER_DAMPING, FINGER_STIFFNESS
-from datagen.workers.trials.trial_scene import Articulation, MovableObjects
+from datagen.workers.trials.trial_scene import MovingBody, TrialScene, pedestal_below, still_parts_near
 
 # Collision groups [own kinds, kinds to collide with, -, -]: shapes collide where one lists the other's kind.
 # Objects collide with everything. The arm collides with objects and static parts, never with itself: the
@@ -87,39 +88,30 @@ class TrialWorld:
     before.
     """
 
-    def __init__(
-        self,
-        still_parts_m: Sequence[F32],  # each (V, 3), world frame
-        pedestal_m: F32 | None,  # (V, 3), world frame
-        things: MovableObjects,
-        robot: Robot,
-        articulation: Articulation,
-        T_world_base: F64,
-        friction: float,
-        params: TrialParams,
-    ) -> None:
+    def __init__(self, scene: TrialScene, T_world_base: F64, opening_m: float, friction: float) -> None:
+        robot, bodies, params = scene.robot, scene.articulation_at(opening_m), scene.params
         self._system = _fresh_system()
         self._system.set_timestep(params.timestep_s)
         self._scene = sapien.Scene([self._system])
-        self._add(still_body(still_parts_m, STILL, friction))
-        if pedestal_m is not None:
+        self._add(still_body(still_parts_near(scene, T_world_base), STILL, friction))
+        if (pedestal_m := pedestal_below(scene, T_world_base)) is not None:
             self._add(still_body([pedestal_m], PEDESTAL, friction))
         self._things = [
             thing_body(parts, float(mass), friction)
-            for parts, mass in zip(things.parts_m, things.mass_kg, strict=True)
+            for parts, mass in zip(scene.parts_m, scene.mass_kg, strict=True)
         ]
-        for body, T in zip(self._things, things.T_world_object, strict=True):
+        for body, T in zip(self._things, scene.T_world_object, strict=True):
             self._add(body, T)
         self._centres = [body.cmass_local_pose for body in self._things]
-        links = _robot_links(robot, articulation, friction, params)
+        links = _robot_links(robot, bodies, friction, params)
         self._links = frozenset(links)
         for link in links:
-            self._add(link, T_world_base @ articulation.T_base_root if link is links[0] else None)
+            self._add(link, T_world_base @ robot.T_base_root if link is links[0] else None)
         self._arm = links[0].articulation
         tune_body(self._arm)
         joints = self._arm.get_active_joints()
         columns = {joint.name: k for k, joint in enumerate(joints)}
-        self._columns = np.array([columns[body.joint] for body in articulation.bodies[1:]])
+        self._columns = np.array([columns[body.joint] for body in bodies[1:]])
         self._coordinates = robot.coordinates
         self._joints = [joints[k] for k in self._columns]
         self._fingers = links[-2:]
@@ -234,29 +226,27 @@ class TrialWorld:
 
     def is_supported(self) -> bool:
         """Whether anything but the robot pushed the target in the last step."""
-        target = self._things[0]
-        for contact in self._system.get_contacts():
-            first, second = contact.bodies
-            if first is target or second is target:
-                other = second if first is target else first
-                pushes = other not in self._links and any(point.impulse.any() for point in contact.points)
-                if pushes:
-                    return True
-        return False
+        return any(
+            other not in self._links and any(point.impulse.any() for point in points)
+            for other, _, points in self._on_target()
+        )
 
     def finger_impulses(self) -> F64:
         """Impulses (2, 3) of the fingers on the target in the last step, newton seconds, world frame."""
         impulses = np.zeros((2, 3))
-        target = self._things[0]
-        for contact in self._system.get_contacts():
-            first, second = contact.bodies
-            if first is target or second is target:
-                other, sign = (second, 1.0) if first is target else (first, -1.0)
-                for k, finger in enumerate(self._fingers):
-                    if other is finger:
-                        for point in contact.points:
-                            impulses[k] += np.multiply(sign, point.impulse)
+        for other, sign, points in self._on_target():
+            for k, finger in enumerate(self._fingers):
+                if other is finger:
+                    for point in points:
+                        impulses[k] += np.multiply(sign, point.impulse)
         return impulses
+
+    def _on_target(self) -> Iterator[tuple[Any, float, Any]]:
+        """Each contact of the target: the other body, the sign of impulses on the target, and the points."""
+        for contact in self._system.get_contacts():
+            for k, sign in enumerate((1.0, -1.0)):
+                if contact.bodies[k] is self._things[0]:
+                    yield contact.bodies[1 - k], sign, contact.points
 
 
 def _fresh_system() -> physx.PhysxCpuSystem:
@@ -270,12 +260,12 @@ def _fresh_system() -> physx.PhysxCpuSystem:
 
 
 def _robot_links(
-    robot: Robot, articulation: Articulation, friction: float, params: TrialParams
+    robot: Robot, bodies: Sequence[MovingBody], friction: float, params: TrialParams
 ) -> list[physx.PhysxArticulationLinkComponent]:
     links: list[physx.PhysxArticulationLinkComponent] = []
     material = physx.PhysxMaterial(friction, friction, 0.0)
-    base, drive, count = int(robot.is_base.sum()), robot.drive, len(articulation.bodies)
-    for k, body in enumerate(articulation.bodies):
+    base, drive, count = int(robot.is_base.sum()), robot.drive, len(bodies)
+    for k, body in enumerate(bodies):
         is_finger = k >= count - 2
         link = physx.PhysxArticulationLinkComponent(links[body.parent] if body.parent >= 0 else None)
         for part in body.parts_m:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -42,16 +42,8 @@ class MovingBody:
     inertia_kgm2: F64  # (3,), along them
 
 
-@dataclass(frozen=True, eq=False)
-class Articulation:
-    """The bodies of a robot: body 0, those that the arm's joints move, then the two fingers."""
-
-    bodies: tuple[MovingBody, ...]
-    T_base_root: F64  # (4, 4), body 0 in the base frame
-
-
-def articulation_of(robot: Robot, opening_m: float = 0.0) -> Articulation:
-    """The bodies that the joints of the arm and of the fingers move.
+def articulation_of(robot: Robot, opening_m: float = 0.0) -> tuple[MovingBody, ...]:
+    """The bodies of a robot: body 0, those that the arm's joints move, then the two fingers.
 
     Fingers that turn slide here, in the posture that they have at an opening.
     """
@@ -71,10 +63,10 @@ def articulation_of(robot: Robot, opening_m: float = 0.0) -> Articulation:
         T_last_tcp = assembly.palm.T_parent_child @ assembly.hand.T_palm_tcp
         for side, parts in zip((1.0, -1.0), robot.gripper.fingers_near(opening_m), strict=True):
             bodies.append(_sliding_finger(robot, parts, side, count, T_last_tcp, fingers))
-        return Articulation(tuple(bodies), robot.T_base_root)
+        return tuple(bodies)
     for body, joint in zip(fingers, assembly.hand.joints, strict=True):
         bodies.append(_body([(body, np.eye(4))], count, joint, T_palm @ _rounded(joint.T_parent_child)))
-    return Articulation(tuple(bodies), robot.T_base_root)
+    return tuple(bodies)
 
 
 def _sliding_finger(
@@ -158,20 +150,11 @@ _MOVED_ABOVE_M = 0.0005  # a moved target starts this far above its support
 
 
 @dataclass(frozen=True, eq=False)
-class MovableObjects:
-    """The movable objects of a trial: object 0 is the target."""
-
-    parts_m: tuple[tuple[F32, ...], ...]  # (K,) convex parts each, object frames
-    mass_kg: F64  # (K,)
-    T_world_object: F64  # (K, 4, 4)
-
-
-@dataclass(frozen=True, eq=False)
 class TrialScene:
-    """A scene and a robot, ready for any number of trials."""
+    """A scene and a robot, ready for any number of trials. Object 0 is the target."""
 
     robot: Robot
-    articulation: Articulation
+    articulation: tuple[MovingBody, ...]
     params: TrialParams
     base_radius_m: float
     still_parts_m: tuple[F32, ...]  # each (V, 3), world frame
@@ -181,7 +164,7 @@ class TrialScene:
     mass_kg: F64  # (K,)
     T_world_object: F64  # (K, 4, 4)
 
-    def articulation_at(self, opening_m: float) -> Articulation:
+    def articulation_at(self, opening_m: float) -> tuple[MovingBody, ...]:
         """The robot's bodies, with fingers that turn as they stand at an opening."""
         return (
             self.articulation
@@ -236,12 +219,12 @@ def pedestal_below(prepared: TrialScene, T_world_base: F64) -> F32 | None:
     )
 
 
-def disturbed_things(prepared: TrialScene, disturbance: Disturbance) -> MovableObjects:
-    """The movable objects with the disturbance applied."""
+def disturbed(prepared: TrialScene, disturbance: Disturbance) -> TrialScene:
+    """The scene with the disturbance applied to its objects."""
     mass_kg, T_world_object = prepared.mass_kg.copy(), prepared.T_world_object.copy()
     mass_kg[0] *= disturbance.mass_scale
     T_world_object[0] = _moved_target(prepared, disturbance.T_target_moved)
-    return MovableObjects(prepared.parts_m, mass_kg, T_world_object)
+    return replace(prepared, mass_kg=mass_kg, T_world_object=T_world_object)
 
 
 def _moved_target(prepared: TrialScene, T_target_moved: F64) -> F64:

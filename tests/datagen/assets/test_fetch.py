@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 from datagen import cli
 from datagen.assets.catalogue import CATALOGUE, CatalogueEntry, select
-from datagen.assets.download import download
-from datagen.assets.fetch import LOCK_NAME, fetch, read_lock
+from datagen.assets.fetch import LOCK_NAME, download, fetch, read_lock
 from datagen.schemas.errors import InputError
 from datagen.workers.source_statement import read_statement
 from tests.datagen.assets.flaky_server import Site, serve
@@ -38,7 +37,7 @@ def site() -> Iterator[Site]:
 def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Pauses between tries, which take no time here."""
     noted: list[float] = []
-    monkeypatch.setattr("datagen.assets.download.time.sleep", noted.append)
+    monkeypatch.setattr("datagen.assets.fetch.time.sleep", noted.append)
     return noted
 
 
@@ -64,7 +63,7 @@ def test_a_later_run_continues_a_half_and_finds_that_one_is_spoilt(
     for spoilt in (False, True):
         site.cut_after, site.statuses = [100_000], []
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("datagen.assets.download.time.sleep", lambda seconds: site.statuses.append(503))
+            patch.setattr("datagen.assets.fetch.time.sleep", lambda seconds: site.statuses.append(503))
             with pytest.raises(InputError, match="gave up"):
                 _get(site, tmp_path / "a")
         assert not (tmp_path / "a").exists() and part.stat().st_size == 100_000
@@ -92,7 +91,7 @@ def test_changed_content_is_not_glued_to_the_old_half(
 ) -> None:
     site.cut_after = [100_000]
     changed = {"/a.bin": BODY[::-1]}
-    monkeypatch.setattr("datagen.assets.download.time.sleep", lambda seconds: site.files.update(changed))
+    monkeypatch.setattr("datagen.assets.fetch.time.sleep", lambda seconds: site.files.update(changed))
     assert _get(site, tmp_path / "a", sha256=None) == hashlib.sha256(BODY[::-1]).hexdigest()
 
 
@@ -153,7 +152,7 @@ def _zip(files: dict[str, bytes]) -> bytes:
 
 def _asset(**changes: object) -> CatalogueEntry:
     values: dict[str, object] = {"name": "toy", "file": "toy.zip", "url": "http://127.0.0.1:9/toy.zip"}
-    values |= {"licence": "CC0-1.0", "into": "toy", "about": "a toy", "archive": True}
+    values |= {"licence": "CC0-1.0", "into": "toy", "about": "a toy"}
     return CatalogueEntry(**(values | changes))  # type: ignore[arg-type]
 
 

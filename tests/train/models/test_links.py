@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.train.hands.links import N_ROOMS, obstacles, room_codes
+from datagen.train.hands.reach import N_ROOMS, obstacles, room_codes
 from datagen.train.inputs import F64, U8, Clouds
 from datagen.workers.motion.arm_links import arm_links
 from datagen.workers.motion.pose_reach import pose_reach, reach_codes
@@ -45,7 +45,7 @@ def rooms(
     arm = pose_reach(name, reach_m)
     reach = reach_codes(arm, axes, *given)
     around = obstacles(cloud_of(points_m, target_points)) * 200
-    return reach[:, 0], room_codes(arm, arm_links(name), around, axes, reach, *given)[:, 0]
+    return reach[:, 0], room_codes(arm, arm_links(name), around, axes, reach, given)[:, 0]
 
 
 @pytest.mark.parametrize(("name", "reach_m"), ROBOTS)

@@ -164,7 +164,7 @@ def test_the_base_of_a_robot_is_not_its_mount(answer: Prediction, tmp_path: Path
 def test_mounts_are_those_of_the_urdfs(name: str) -> None:
     from datagen.workers.robots.assembly import assemble
 
-    T = assemble(robot_source(name), None).T_root_mount
+    T = assemble(robot_source(name), None).base.T_root_mount
     np.testing.assert_allclose(T[:3, :3], np.eye(3), atol=1e-9)
     np.testing.assert_allclose(T[:2, 3], MOUNTS_M.get(name, (0.0, 0.0)), atol=1e-4)
 

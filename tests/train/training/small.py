@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from datagen.train.training.loop import TrainingStep, run_training
+from datagen.train.training.loop import TrainingProgress, TrainingStep, run_training
 from datagen.train.training.options import Options
 from datagen.train.training.training_setup import TrainingJob, prepare_training, save_checkpoint
 
@@ -35,7 +35,7 @@ def job_of(runs: Path, out: Path, **changes: Any) -> TrainingJob:
     return TrainingJob(Options(**{**fields, **changes}), (str(runs),), (), str(out))
 
 
-class Recorder:
+class Recorder(TrainingProgress):
     """Keeps all steps and epochs."""
 
     def __init__(self) -> None:

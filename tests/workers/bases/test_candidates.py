@@ -18,14 +18,14 @@ from datagen.workers.bases.candidates import (
     draw_candidates,
     grid_offsets,
 )
-from datagen.workers.bases.clearance import Footprint, Obstacles, base_clearance_m, obstacles_of
+from datagen.workers.bases.clearance import Footprint, HouseObstacles, base_clearance_m
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.houses.house import StaticBody
 from tests.workers.worlds import ROOM_M, TABLE_SIZE_M, TABLE_TOP_M, box_body, table_house
 
 MIDDLE = (ROOM_M[0] / 2, ROOM_M[1] / 2)
 TARGET = np.array([MIDDLE[0] - 0.35, MIDDLE[1] - 0.2, TABLE_TOP_M + 0.05])  # near a corner
-OBSTACLES = obstacles_of(table_house())
+OBSTACLES = HouseObstacles(table_house())
 SAME_HEIGHTS = {"camera_height_m": {"low": 1.2, "high": 1.2}, "base_height_m": {"low": 0.7, "high": 0.7}}
 
 
@@ -166,7 +166,7 @@ class OneSide:
 
 def plain_candidates(
     target_m: np.ndarray,
-    obstacles: Obstacles,
+    obstacles: HouseObstacles,
     params: CandidateParams,
     rng: np.random.Generator,
     hand: OneSide | None = None,
@@ -246,12 +246,13 @@ def test_candidates_with_within_are_those_of_trying_every_robot_everywhere(
     seed: int, within: str, scaled: bool, n: int, robots: int, data: st.DataObject
 ) -> None:
     gaps = data.draw(st.lists(st.floats(0.0, 0.6), min_size=4, max_size=4))
-    obstacles = obstacles_of(table_house([cupboard(k, gap) for k, gap in enumerate(gaps)]))
+    house = table_house([cupboard(k, gap) for k, gap in enumerate(gaps)])
     # Floors may end where nothing stands.
     inset_m = data.draw(st.floats(0.0, 0.8))
     low, high = (inset_m, inset_m), (ROOM_M[0] - inset_m, ROOM_M[1] - inset_m)
     floor = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
-    obstacles = replace(obstacles, floors_m=(floor,))
+    (room,) = house.rooms
+    obstacles = HouseObstacles(replace(house, rooms=(replace(room, polygon_m=floor),)))
     given = {"per_scene": n, "within": within, "scaled_base": scaled, "robots_per_scene": robots}
     if data.draw(st.booleans()):
         given["footprint_m"] = [[0.3, 0.15], [-0.45, 0.2], [-0.4, -0.2], [0.3, -0.15]]

@@ -13,9 +13,8 @@ from datagen.workers.bases.clearance import (
     Footprint,
     HouseObstacles,
     Obstacles,
-    Surroundings,
     base_clearance_m,
-    obstacles_of,
+    distances_from_obstacles,
 )
 from datagen.workers.geometry.planar import convex_hull, polygons_at, signed_distances_to_convex
 from datagen.workers.houses.house import House
@@ -32,7 +31,7 @@ def clearance(
 ) -> float:
     place, heights = np.float32([[x, y]]), np.float32([[base_height_m], [camera_height_m]])
     radius_m = np.array([PARAMS.base_radius_m])
-    return float(base_clearance_m(place, *heights, radius_m, obstacles_of(house), PARAMS.mast_radius_m)[0])
+    return float(base_clearance_m(place, *heights, radius_m, HouseObstacles(house), PARAMS.mast_radius_m)[0])
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.1, 0.3])
@@ -85,13 +84,18 @@ def of_outlines(
     footprint: Footprint | None,
     xy: np.ndarray,
     yaw: np.ndarray,
-    obstacles: Surroundings,
+    obstacles: Obstacles,
     radius_m: float = 0.25,
     camera_m: float = 1.2,
 ) -> np.ndarray:
     heights = np.full((2, len(xy)), [[0.7], [camera_m]], np.float32)
-    radii = np.full(len(xy), radius_m)
-    return base_clearance_m(xy.astype(np.float32), *heights, radii, obstacles, 0.05, footprint, yaw)
+    at = xy.astype(np.float32).astype(np.float64)
+    around = distances_from_obstacles(at, obstacles, footprint, yaw, 0.7)
+    return around.clearance_m(*heights, np.full(len(xy), radius_m), 0.05)
+
+
+def obstacles_of(house: House) -> Obstacles:
+    return HouseObstacles(house).near(np.zeros((1, 2)), np.inf, np.inf)
 
 
 def poses(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -107,8 +111,10 @@ def test_footprints_on_demand_give_the_clearance_of_all(seed: int, n: int, outli
     house = table_house([lamp])
     on_demand = HouseObstacles(house)
     for rows in (slice(n), slice(None)):
-        some = outline, xy[rows], yaw[rows]
-        np.testing.assert_array_equal(of_outlines(*some, on_demand), of_outlines(*some, obstacles_of(house)))
+        heights = np.full((2, len(xy[rows])), [[0.7], [1.2]], np.float32)
+        radii = np.full(len(xy[rows]), 0.25)
+        found = base_clearance_m(xy[rows], *heights, radii, on_demand, 0.05, outline, yaw[rows])
+        np.testing.assert_array_equal(found, of_outlines(outline, xy[rows], yaw[rows], obstacles_of(house)))
 
 
 @given(st.integers(0, 2**32), st.floats(0.1, 0.5))

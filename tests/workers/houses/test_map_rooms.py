@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from datagen import cli
 from datagen.schemas.errors import InputError
-from datagen.workers.bases.clearance import base_clearance_m, obstacles_of
+from datagen.workers.bases.clearance import HouseObstacles, base_clearance_m
 from datagen.workers.geometry.planar import convex_hull, inside_polygon
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.houses import open_houses
@@ -109,7 +109,7 @@ def test_each_cell_is_floor_wall_or_hidden_as_the_map_says(
     few = rng.choice(np.flatnonzero(clear & off_table), 200)
     heights = np.full(200, 0.5, np.float32)
     found = base_clearance_m(
-        xy_m[few].astype(np.float32), heights, heights, np.full(200, 1e-3), obstacles_of(house), 1e-3
+        xy_m[few].astype(np.float32), heights, heights, np.full(200, 1e-3), HouseObstacles(house), 1e-3
     )
     np.testing.assert_array_equal(found >= 0, floor[few])
 

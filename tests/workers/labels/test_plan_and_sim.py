@@ -26,7 +26,7 @@ from datagen.schemas.specification import (
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.transforms import pose, translation
-from datagen.workers.labels import arm_labelling, load_label_source, plan_source
+from datagen.workers.labels import arm_labelling, arm_sources, load_label_source
 from datagen.workers.labels.arm_labelling import arm_in_scene, draw_disturbances, try_candidate
 from datagen.workers.motion import MotionPlan
 from datagen.workers.scenes import SettledScene
@@ -146,7 +146,7 @@ def test_the_first_grasp_decides_and_later_ones_are_stored(monkeypatch: pytest.M
         return run_trial(trials, T_world_base, plan, *rest)
 
     monkeypatch.setattr(arm_labelling, "run_trial", run_and_note)
-    _, trials = plan_source.label_with_trials(at, candidates(at), spec, StageClock())
+    _, trials = arm_sources.label_with_trials(at, candidates(at), spec, StageClock())
     tried = [trial for trial in trials if trial.results]
     assert len(tried) == 3
     assert all(len(set(executed[k : k + 3])) == 3 for k in (0, 3, 6)) and len(executed) == 9

@@ -283,7 +283,9 @@ def test_the_hand_closes_on_a_box_of_each_width(robot: Robot) -> None:
     depths = gripper.pad_depth_m(openings)
     assert np.abs(np.diff(depths)).max() < 0.02
     poses = gripper.body_poses(openings)
-    shapes = [[polyhedron(part) for part in parts] for parts in gripper.body_parts_m]
+    known = gripper.linkage
+    bodies = (gripper.palm_parts_m, *gripper.finger_parts_m) if known is None else known.parts_m
+    shapes = [[polyhedron(part) for part in parts] for parts in bodies]
     for width, depth, T in zip(openings, depths, poses, strict=True):
         for margin in (-0.002, 0.002):
             size = np.array([gripper.pad_size_m[0], width + margin, gripper.pad_size_m[1]])

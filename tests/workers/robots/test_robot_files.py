@@ -302,4 +302,4 @@ def test_robots_that_only_their_own_joints_can_describe() -> None:
     tool = np.array([0.18, 0.0, 0.0])  # r_gripper_tool_frame
     assert np.linalg.norm(pr2.assembly.hand.T_palm_tcp[:3, 3] - tool) < 0.01
     tiago = open_robot("tiago-pro", None, robot_limits("tiago-pro").base_height_m[0])  # pyright: ignore[reportOptionalSubscript]
-    assert len(tiago.gripper.body_parts_m) == 7
+    assert tiago.gripper.linkage is not None and len(tiago.gripper.linkage.parts_m) == 7

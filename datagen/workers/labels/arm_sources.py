@@ -1,4 +1,5 @@
-"""Label source `plan`: positive where the arm has a complete plan for grasp and lift."""
+"""Label sources of an arm: positive where it has a complete plan for grasp and lift (`plan`), and where that
+plan, executed in physics, lifts and holds the target (`sim`)."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from datagen.schemas.fields import OUTCOMES
+from datagen.schemas.fields import OUTCOMES, RETRY_OUTCOMES
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import SceneCandidates
@@ -26,7 +27,10 @@ from datagen.workers.watched_clock import count_label
 
 # 4: planned by machine code; all free grasps in reach are tried, then poses near them.
 VERSION = 4
-_CODES = {name: code for code, name in enumerate(OUTCOMES)}
+# 2: the first grasp alone decides, lift and slip are measured at the grasp, thrown objects are `unstable`.
+# 4: plans are those of `plan` labels of version 4.
+SIM_VERSION = 4
+_CODES, _RETRY_CODES = ({name: code for code, name in enumerate(each)} for each in (OUTCOMES, RETRY_OUTCOMES))
 
 
 def label(
@@ -95,4 +99,25 @@ def _write_plan(columns: Columns, k: int, at: ArmInScene, T_world_base: F64, pla
     columns["path_clearance_m"][k] = plan.clearance_m
 
 
+def label_executed(
+    scene: SettledScene, candidates: SceneCandidates, spec: Specification, clock: StageClock
+) -> Columns:
+    """The columns of `plan`, with outcomes and measurements of trials."""
+    columns, trials = label_with_trials(scene, candidates, spec, clock)
+
+    def column(dtype: str, values: list[float]) -> np.ndarray:
+        return np.array(values, dtype)
+
+    columns |= {
+        "attempts": column("int16", [len(t.results) for t in trials]),
+        "retry_outcome": column("uint8", [_RETRY_CODES[t.retry_outcome or "none"] for t in trials]),
+        "lift_m": column("float32", [t.results[-1].lift_m if t.results else 0.0 for t in trials]),
+        "slip_m": column("float32", [t.results[-1].slip_m if t.results else 0.0 for t in trials]),
+        "disturbed_m": column("float32", [t.results[-1].disturbed_m if t.results else 0.0 for t in trials]),
+        "simulated_s": column("float32", [sum(r.simulated_s for r in t.results) for t in trials]),
+    }
+    return columns
+
+
 PLAN = LabelSource("plan", VERSION, "plan", label)
+SIM = LabelSource("sim", SIM_VERSION, "sim", label_executed)
