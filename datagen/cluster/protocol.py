@@ -208,9 +208,8 @@ class StopRequest:
 
     def __init__(self) -> None:
         self._count = 0
-        self.store_until_s = float(
-            "inf"
-        )  # when to give up an object store that fails, by the monotonic clock
+        # When to give up an object store that fails, by the monotonic clock.
+        self.store_until_s = float("inf")
 
     def ask(self) -> None:
         self._count += 1
