@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.specification import Specification
+from datagen.schemas.specification import PlaceKind, Specification
 from datagen.workers.bases.clearance import HouseObstacles
 from datagen.workers.content_cache import CacheFolder
 from datagen.workers.geometry.mesh import F64
@@ -57,6 +57,8 @@ class World:
     house_ids: list[str]
     object_names: list[str]
     target_names: list[str]
+    # By house seen before: kinds of places that it lacks, with the reason. It is not loaded for them again.
+    lacking: dict[str, dict[PlaceKind, str]] = field(default_factory=dict)
     _houses: OrderedDict[str, PreparedHouse] = field(default_factory=OrderedDict)
     _objects: dict[str, ObjectModel] = field(default_factory=dict)
     _bad_houses: dict[str, tuple[str, str, str, str]] = field(default_factory=dict)

@@ -11,7 +11,14 @@ import numpy as np
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.run_records import StageClock
-from datagen.schemas.specification import CandidateParams, ObservationParams, SettleParams, Specification
+from datagen.schemas.specification import (
+    PLACE_KINDS,
+    CandidateParams,
+    ObservationParams,
+    PlaceKind,
+    SettleParams,
+    Specification,
+)
 from datagen.workers.bases.candidates import SceneCandidates, draw_candidates
 from datagen.workers.bases.clearance import HouseObstacles, base_clearance_m
 from datagen.workers.geometry.mesh import F64
@@ -105,10 +112,8 @@ def _try_scene(
     with clock.stage("draw"):
         kind, _ = draw_place(spec.scene, generator(spec.seed, Stream.PLACE, index))
         rng = generator(spec.seed, Stream.SCENE, index, retry)
-        house = _load_house(world, world.house_ids[rng.integers(len(world.house_ids))])
+        house = _house_with(world, world.house_ids[rng.integers(len(world.house_ids))], kind)
         surfaces = eligible_surfaces(house.house, spec.scene, kind)
-        if not surfaces:
-            raise SceneRejected("no_surface", describe_surfaces(house.house, spec.scene, kind))
         surface = surfaces[rng.integers(len(surfaces))]
         names = _draw_names(world, rng, clock)
         standing = standing_parts(house.house, surface)
@@ -161,13 +166,23 @@ def _reach_of(spec: Specification) -> ReachableSet | None:
     return reachable_set_of(spec.arm.robot_key)
 
 
-def _load_house(world: World, house_id: str) -> PreparedHouse:
-    """The house. Raises SceneRejected if it is damaged, so that the job continues with another."""
+def _house_with(world: World, house_id: str, kind: PlaceKind) -> PreparedHouse:
+    """The house. Raises SceneRejected if it is damaged or has no such place, and the job draws another."""
+    if kind in (lacking := world.lacking.get(house_id, {})):
+        raise SceneRejected("no_surface", lacking[kind])
     try:
-        return world.house(house_id)
+        house = world.house(house_id)
     except InputError as error:
         where = f"{error.place}: {error.field}" if error.field else error.place
         raise SceneRejected("bad_house", f"{where}: {error.problem}") from error
+    if house_id not in world.lacking:
+        world.lacking[house_id] = {
+            each: describe_surfaces(house.house, world.spec.scene, each)
+            for each in PLACE_KINDS
+            if not eligible_surfaces(house.house, world.spec.scene, each)
+        }
+        return _house_with(world, house_id, kind)
+    return house
 
 
 def _draw_names(world: World, rng: np.random.Generator, clock: StageClock) -> list[str]:

@@ -68,6 +68,25 @@ def _samples(columns: dict[str, np.ndarray], scene: int) -> dict[str, np.ndarray
     return {name: column[own] for name, column in columns.items()}
 
 
+def test_houses_seen_to_lack_a_place_are_not_loaded_for_it_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = world_of(
+        SceneParams(places=Places(top=1.0), support_height_m={"low": 0.95, "high": 1.0}, n_clutter=1)
+    )
+    first, loaded = run_shard(world.spec, world, [0, 1, 2, 3]), list[str]()
+    lacking = {house_id for house_id, kinds in world.lacking.items() if "top" in kinds}
+    assert lacking and first.redraws["no_surface"] >= len(lacking)
+    monkeypatch.setattr(
+        World,
+        "house",
+        lambda self, house_id, load=World.house: loaded.append(house_id) or load(self, house_id),
+    )
+    again = run_shard(world.spec, world, [0, 1, 2, 3])
+    assert loaded and not lacking & set(loaded)
+    assert again.redraws == first.redraws
+    for name, column in first.scene.items():
+        np.testing.assert_array_equal(again.scene[name], column, err_msg=name)
+
+
 def test_decisive_scenes_are_drawn_until_their_share_is_between_the_limits() -> None:
     world = world_of(
         SceneParams(places=Places(seat=1.0), decisive=1.0, n_clutter=3),
