@@ -4,9 +4,10 @@
 
 Clear candidates within reach of scenes of a `plan` run of whole grids that have a good one. Each is labelled
 again under other draws of grasps, seeds and paths (`benchmarks.repeatability`), and each scene is observed
-from other viewpoints. A row is a way to pick one candidate of a scene; columns are how often it is good by
-the stored labels and on average by the other draws. "Labels of a draw" picks by labels that know the whole
-scene: of the good candidates of another draw the one nearest to 0.75 of the reach, judged by the others.
+from other viewpoints, from fewer where no other place sees the target. A row is a way to pick one candidate
+of a scene; columns are how often it is good by the stored labels and on average by the other draws. "Labels
+of a draw" picks by labels that know the whole scene: of the good candidates of another draw the one nearest
+to 0.75 of the reach, judged by the others.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ import numpy as np
 
 from benchmarks.repeatability import Labelling, label_scene, stored_scenes, within_reach
 from datagen.schemas.run import Run
-from datagen.schemas.specification import Specification
+from datagen.schemas.specification import DECISIVE_SHARES, ObservationParams, Specification
 from datagen.train.dataset import SampleStream
 from datagen.train.inputs import I64, Array, Clouds
 from datagen.train.prediction import load_scorer
-from datagen.workers.rendering.cloud import Cloud, farthest_points, observe_cloud
+from datagen.workers.rendering.cloud import Cloud, observe_cloud, stored_cloud
 from datagen.workers.rendering.embree import cast_pixels
 from datagen.workers.scenes.generate import draw_viewpoint
 from datagen.workers.scenes.placement import SceneRejected
@@ -31,7 +32,6 @@ from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_c
 from datagen.workers.world import open_world
 
 _SHARE = 0.75  # of the reach
-_DECISIVE = (0.05, 0.6)
 _TARGET_POINTS = 256  # of the target in a fused cloud
 _SEED = 0
 
@@ -46,12 +46,14 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=2)
     parser.add_argument("--views", type=int, default=2)
     options = parser.parse_args()
+    if options.draws < 2:
+        parser.error("--draws: labels of a draw need another that judges them. Give 2 or more")
     picked: dict[str, list[tuple[float, float]]] = {}
     decisive = list[bool]()
     for labels, rows in _scenes(options):
-        decisive.append(_DECISIVE[0] <= labels[0].mean() <= _DECISIVE[1])
+        decisive.append(DECISIVE_SHARES[0] <= labels[0].mean() <= DECISIVE_SHARES[1])
         for name, row in rows.items():
-            others = [labels[d, row] for d in range(1, len(labels)) if f"draw {d}" not in name]
+            others = [labels[d, row] for d in range(1, len(labels)) if name != f"labels of draw {d}"]
             picked.setdefault(name, []).append((float(labels[0, row]), float(np.mean(others))))
     print(f"{len(decisive)} scenes, {sum(decisive)} decisive; {options.draws} other draws\n")
     print("| pick | all: stored | other draws | decisive: stored | other draws |")
@@ -87,7 +89,9 @@ def _scenes(options: argparse.Namespace) -> Iterator[tuple[I64, dict[str, int]]]
             *_views(scene, str(stored.record["room_id"]), spec, batch.clouds, number, options.views),
         ]
         seen = {"model": clouds[0], "model, another view": clouds[min(1, len(clouds) - 1)]}
-        seen[f"model, {1 + options.views} views"] = _fused(clouds, np.random.default_rng([_SEED, number]))
+        seen[f"model, {1 + options.views} views"] = _fused(
+            clouds, spec.observation, np.random.default_rng([_SEED, number])
+        )
         for name, cloud in seen.items():
             rows[name] = int(np.argmax(scorer.score(replace(batch, clouds=cloud))[near]))
         for draw in range(1, options.draws + 1):
@@ -129,24 +133,18 @@ def _as(seen: Cloud, like: Clouds[Array]) -> Clouds[Array]:
     )
 
 
-def _fused(clouds: Sequence[Clouds[Array]], rng: np.random.Generator) -> Clouds[Array]:
+def _fused(
+    clouds: Sequence[Clouds[Array]], params: ObservationParams, rng: np.random.Generator
+) -> Clouds[Array]:
     """As many points of all the clouds as one has, those of the target first drawn."""
-    size, first = clouds[0].points_m.shape[1], clouds[0]
     points_m, rgb, mask = (
         np.concatenate([getattr(c, name)[0, : c.n_points[0]] for c in clouds])
         for name in ("points_m", "rgb", "target_mask")
     )
     order = rng.permutation(len(points_m))
     on = order[mask[order]][:_TARGET_POINTS]
-    order = np.concatenate([on, order[~np.isin(order, on)]])[:size]
-    start = farthest_points(points_m[order], min(512, len(order)))
-    order = np.concatenate([order[start], np.delete(order, start)])
-    seen = Cloud(
-        np.zeros((size, 3), np.float16), np.zeros((size, 3), np.uint8), np.zeros(size, np.bool_), len(order)
-    )
-    for whole, part in ((seen.points_m, points_m), (seen.rgb, rgb), (seen.target_mask, mask)):
-        whole[: len(order)] = part[order]
-    return _as(seen, first)
+    order = np.concatenate([on, order[~np.isin(order, on)]])
+    return _as(stored_cloud(points_m[order], rgb[order], mask[order], params), clouds[0])
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from datagen.schemas.run import Run
-from datagen.schemas.specification import Specification
+from datagen.schemas.specification import DECISIVE_SHARES, Specification
 from datagen.train.dataset import SampleStream
 from datagen.train.hands.poses import N_MEASURES, hand_poses
 from datagen.train.hands.sizes import hand_size
@@ -42,7 +42,6 @@ _POSES = 104  # all directions of `hand_poses`
 _NEAR_M, _FINE_M, _COARSE_M = 0.3, 0.02, 0.05  # boxes around the target, and farther away
 _FLOOR_M = 0.03  # points below are floor
 _SHARE = 0.75  # of the reach
-_DECISIVE = (0.05, 0.6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +180,7 @@ def _print(run: str, asked: list[Asked], cpu_s: float) -> None:
         np.concatenate([getattr(each, name) for each in asked])
         for name in ("label", "score", "planned", "share")
     )
-    decisive = [each for each in asked if _DECISIVE[0] <= each.label.mean() <= _DECISIVE[1]]
+    decisive = [each for each in asked if DECISIVE_SHARES[0] <= each.label.mean() <= DECISIVE_SHARES[1]]
     n, off = len(label), np.abs(share - _SHARE)
     print(f"{run}: {n:,} candidates of {len(asked)} scenes, of which {len(decisive)} are decisive")
     print(

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from datagen.drawing.trial_picture import Retrial
 
 _POINT_M, _BASE_M = 0.005, 0.04
-_SHEER = (255, 255, 255, 40)  # of walls, through which rooms are seen
+_SEE_THROUGH = (255, 255, 255, 40)  # of walls
 _ABOUT = "__properties"  # where Rerun keeps what it says of a recording
 # Of a file of Rerun: bytes before the first message, and kinds of messages.
 _HEADER_BYTES, _END, _STORE = 12, 0, 1
@@ -65,10 +65,10 @@ def _chunks(run: Run, rows: SceneRows, scene: ReconstructedScene) -> Iterator[Ch
     n, trial = int(record["n_points"]), _best_trial(run, rows, scene)
     yield _static("/", rr.ViewCoordinates, xyz=[rr.components.ViewCoordinates.RIGHT_HAND_Z_UP])
     yield _static(_ABOUT, rr.archetypes.RecordingInfo, name=[f"scene {scene.index}: {scene.models[0].name}"])
-    bodies = [(body.object_type == "Wall", body.visual) for body in scene.house.house.bodies]
-    yield _mesh("house", concatenate([visual for is_wall, visual in bodies if not is_wall]))
-    if walls := [visual for is_wall, visual in bodies if is_wall]:
-        yield _mesh("walls", concatenate(walls), albedo_factor=[_SHEER])
+    bodies = scene.house.house.bodies
+    for path, are_walls, more in (("house", False, {}), ("walls", True, {"albedo_factor": [_SEE_THROUGH]})):
+        if meshes := [body.visual for body in bodies if (body.object_type == "Wall") == are_walls]:
+            yield _mesh(path, concatenate(meshes), **more)
     for k, (model, T) in enumerate(zip(scene.models, scene.T_world_object, strict=True)):
         yield _mesh(f"objects/{k}", model.visual)
         if trial is None:  # a static pose would hide one over time

@@ -6,59 +6,19 @@ scenes, of which a run makes the first n samples.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from datagen.schemas.identity import digest_of
+from datagen.schemas.intervals import Corner, Fraction, Frozen, Interval, Metres, Range, Turns
 
 # Scenes are decisive where between these shares of the clear candidates in reach are good.
 DECISIVE_SHARES = (0.05, 0.6)
 # The reach that Franka Emika states for the Panda.
 PANDA_REACH_M = 0.855
-
-Metres = Annotated[float, Field(ge=0.0, le=100.0, allow_inf_nan=False)]
-Offset = Annotated[float, Field(ge=-20.0, le=20.0, allow_inf_nan=False)]
-Corner = Annotated[tuple[Offset, Offset], Field(strict=False)]
-Angle = Annotated[float, Field(ge=-3.14159266, le=3.14159266)]
-Fraction = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
-
-
-class Frozen(BaseModel):
-    """A section: strict, and without NaN."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class _Ordered(Frozen):
-    low: float
-    high: float
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.high < self.low:
-            raise ValueError(f"high {self.high} is below low {self.low}")
-        return self
-
-
-class Range(_Ordered):
-    """A closed interval in metres, from which a length is sampled uniformly."""
-
-    low: Metres
-    high: Metres
-
-
-class Turns(_Ordered):
-    """A closed interval of angles (rad), counter-clockwise, from which one is sampled uniformly."""
-
-    low: Angle
-    high: Angle
-
-
-class Interval(Range):
-    """A closed interval, without unit, from which a number is sampled uniformly."""
 
 
 class Source(Frozen):

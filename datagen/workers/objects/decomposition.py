@@ -28,7 +28,8 @@ _LONGEST_S = 600.0
 LATE = "has no convex parts after"
 _PROGRAM = """
 import ctypes, io, json, sys
-ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL: end where the parent does
+if sys.platform == "linux":
+    ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL: end where the parent does
 import coacd, numpy as np
 given = np.load(io.BytesIO(sys.stdin.buffer.read()))
 coacd.set_log_level("off")

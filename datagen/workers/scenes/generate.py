@@ -168,21 +168,20 @@ def _reach_of(spec: Specification) -> ReachableSet | None:
 
 def _house_with(world: World, house_id: str, kind: PlaceKind) -> PreparedHouse:
     """The house. Raises SceneRejected if it is damaged or has no such place, and the job draws another."""
-    if kind in (lacking := world.lacking.get(house_id, {})):
-        raise SceneRejected("no_surface", lacking[kind])
     try:
-        house = world.house(house_id)
+        if house_id not in world.lacking:
+            house, scene = world.house(house_id).house, world.spec.scene
+            world.lacking[house_id] = {
+                each: describe_surfaces(house, scene, each)
+                for each in PLACE_KINDS
+                if not eligible_surfaces(house, scene, each)
+            }
+        if kind in world.lacking[house_id]:
+            raise SceneRejected("no_surface", world.lacking[house_id][kind])
+        return world.house(house_id)
     except InputError as error:
         where = f"{error.place}: {error.field}" if error.field else error.place
         raise SceneRejected("bad_house", f"{where}: {error.problem}") from error
-    if house_id not in world.lacking:
-        world.lacking[house_id] = {
-            each: describe_surfaces(house.house, world.spec.scene, each)
-            for each in PLACE_KINDS
-            if not eligible_surfaces(house.house, world.spec.scene, each)
-        }
-        return _house_with(world, house_id, kind)
-    return house
 
 
 def _draw_names(world: World, rng: np.random.Generator, clock: StageClock) -> list[str]:
