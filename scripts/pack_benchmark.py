@@ -25,6 +25,7 @@ from datagen.evaluation.benchmark import (
     present_runs,
     read_benchmark,
     refuse_differing,
+    truth_field,
 )
 from datagen.evaluation.columns import EXTRA
 from datagen.schemas.errors import InputError
@@ -71,11 +72,12 @@ def write_pack(
     held = 0
     for k, (name, path) in enumerate(paths.items()):
         part, schema, columns = _first_scenes(path, (scenes + len(paths) - 1 - k) // len(paths))
-        n, digests = len(columns["sample_id"]), digests_over([columns])
+        truth = truth_field(path, part.specs)
+        n, digests = len(columns["sample_id"]), digests_over([columns], truth)
         held += len(columns["scene_index"])
         packed[name] = benchmark.runs[name].model_copy(update={"n": n, "digests": digests})
         if not with_labels:
-            kept = tuple(field for field in schema.sample_fields if field.name != "label")
+            kept = tuple(field for field in schema.sample_fields if field.name not in {"label", truth})
             schema = replace(schema, sample_fields=kept)
         sources = part.sources[0]
         file = out / f"{name}{ZIPPED}"
@@ -91,8 +93,9 @@ def _first_scenes(path: str, scenes: int) -> tuple[RunPart, RecordSchema, Column
     """The run, the fields that a pack has, and its first whole scenes, at most `scenes`, in stored order."""
     (run,) = open_parts([path], JOIN_FIELDS)
     schema = sized_schema(run.schema, run.specs[0], run.schema_version)
+    packed = {*_PACKED, truth_field(path, run.specs)}
     scene, sample = (
-        tuple(field for field in fields if field.name in _PACKED)
+        tuple(field for field in fields if field.name in packed)
         for fields in (schema.scene_fields, schema.sample_fields)
     )
     schema = replace(schema, scene_fields=scene, sample_fields=sample)

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, field_serializer
 
 from datagen.evaluation.methods import EvaluatedMethod
-from datagen.evaluation.runs import EvaluatedRun
+from datagen.evaluation.runs import EvaluatedRun, draws_of
 from datagen.schemas.errors import InputError, choices
 from datagen.schemas.identity import digest_of
 from datagen.schemas.record_files import different_fields
@@ -27,20 +27,19 @@ from datagen.schemas.sealing import ZIPPED
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
 from datagen.train.reader import Columns, read_shards
-from datagen.train.run_parts import JOIN_FIELDS, open_parts
+from datagen.train.run_parts import JOIN_FIELDS, open_parts, specs_of
 
 DEFINITION = "benchmark.json"
 SHIPPED = Path(str(files("datagen.evaluation") / DEFINITION))
 PACK = SHIPPED.with_name("pack")
 _MOST_BYTES = 2**20
 _MOST_SHOWN = 5
-_FIELDS = ("sample_id", "label")
 # A run's name is that of its folder.
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,39}$")]
 
 
 class RunDigests(StoredRecord):
-    """sha256 over the ids of all candidates in stored order, and over their labels."""
+    """sha256 over the ids of all candidates in stored order, and over their labels, or successes of draws."""
 
     candidates: Digest
     labels: Digest
@@ -153,15 +152,21 @@ def _has(folder: str, file: str) -> bool:
 
 def digests_of(path: str | Path) -> RunDigests:
     """The digests of a complete run or of its sealed store; copies have the same digests."""
-    return digests_over(read_shards(open_parts([path], (*JOIN_FIELDS, *_FIELDS))))
+    truth = truth_field(str(path), specs_of(path))
+    return digests_over(read_shards(open_parts([path], (*JOIN_FIELDS, "sample_id", truth))), truth)
 
 
-def digests_over(shards: Iterable[Columns]) -> RunDigests:
+def truth_field(place: str, specs: Sequence[Specification]) -> Literal["successes", "label"]:
+    """The field of a run by which methods are judged."""
+    return "successes" if draws_of(place, specs) else "label"
+
+
+def digests_over(shards: Iterable[Columns], truth: Literal["successes", "label"]) -> RunDigests:
     """The digests of a run with these columns."""
     candidates, labels = hashlib.sha256(), hashlib.sha256()
     for columns in shards:
         candidates.update(columns["sample_id"].tobytes())
-        labels.update(columns["label"].astype("u1").tobytes())
+        labels.update(columns[truth].astype("u1").tobytes())
     return RunDigests(candidates=candidates.hexdigest(), labels=labels.hexdigest())
 
 
@@ -172,7 +177,7 @@ def refuse_differing(path: str, name: str, wanted: BenchmarkRun, version: str) -
     """
     definition = f"run {name} of benchmark {version}"
     fix = f"Make it with `datagen benchmark make --run {name}`, or copy the run"
-    parts = open_parts([path], (*JOIN_FIELDS, *_FIELDS))
+    parts = open_parts([path], (*JOIN_FIELDS, "sample_id"))
     for part in parts:
         ours, theirs = (s.model_dump(mode="json") for s in (wanted.spec, part.specs[0]))
         if rows := different_fields(ours, theirs):

@@ -312,7 +312,7 @@ def score_runs(
             done += scenes
             seen(done, total)
 
-        batches = [(run.cells, run.stream.epoch(0)) for run in runs]
+        batches = [(run.cells, run.batches()) for run in runs]
         columns, seconds = gather(batches, {m.name: m.scorer for m in methods}, step)
     reached = (k for k, run in enumerate(runs) if all(s.candidates.in_range_by for s in run.specs))
     columns = replace(columns, reached_runs=tuple(reached))

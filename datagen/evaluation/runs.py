@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from datagen.evaluation.columns import EXTRA
 from datagen.released import checkpoint_file
@@ -14,6 +16,7 @@ from datagen.schemas.specification import Specification
 from datagen.train.baselines import FIELDS
 from datagen.train.dataset import SampleStream
 from datagen.train.headings import refuse_sampled_yaw
+from datagen.train.inputs import Array, Batch
 from datagen.train.run_parts import refuse_mixed_labels, specs_of
 from datagen.workers.bases.candidate_sets import CANDIDATE_SETS
 
@@ -42,6 +45,13 @@ class EvaluatedRun:
         widths = {None: 3, "clear": 2, "in-range": 1}
         return CANDIDATE_SETS[: min(widths[s.candidates.within] for s in self.specs)]
 
+    def batches(self) -> Iterator[Batch[Array]]:
+        """Its candidates in stored order; where several draws were planned, good is what most of them call so."""
+        draws = draws_of(self.place, self.specs)
+        for batch in self.stream.epoch(0):
+            most = None if draws is None else 2 * batch.extra["successes"] > draws
+            yield batch if most is None else replace(batch, label=most.astype(np.int64))
+
     def record(self) -> dict[str, Any]:
         """Its entry in the report."""
         return {
@@ -52,6 +62,14 @@ class EvaluatedRun:
             "parts": [spec.summary() for spec in self.specs],
             "origin": self.stream.origin(),
         }
+
+
+def draws_of(place: str, specs: Sequence[Specification]) -> int | None:
+    """Draws that each candidate was planned with, None for one alone. InputError where merged parts differ."""
+    found = {spec.arm.draws for spec in specs if spec.arm is not None}
+    if len(found) > 1:
+        raise InputError(place, "arm.draws", "differs between its parts", "Evaluate the parts one by one")
+    return next(iter(found), None)
 
 
 def split_paths(paths: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -104,7 +122,8 @@ def open_evaluated_runs(paths: Sequence[str]) -> list[EvaluatedRun]:
 
 def stream_of(paths: Sequence[str]) -> SampleStream:
     """The samples of runs in stored order, with all that evaluation and baselines read."""
-    extra = tuple(dict.fromkeys((*EXTRA, *FIELDS)))
+    drawn = any(draws_of(path, specs_of(path)) for path in paths)
+    extra = tuple(dict.fromkeys((*EXTRA, *FIELDS, *(("successes",) if drawn else ()))))
     return SampleStream(paths, scenes_per_batch=SCENES_PER_BATCH, extra=extra, shuffle=False)
 
 

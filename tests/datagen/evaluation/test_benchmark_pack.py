@@ -82,7 +82,7 @@ def test_scores_on_a_pack_are_those_of_its_scenes_in_the_runs(
 
     def columns_of(paths: list[str]) -> Any:
         runs = open_evaluated_runs(paths)
-        return gather([(run.cells, run.stream.epoch(0)) for run in runs], scorers)[0]
+        return gather([(run.cells, run.batches()) for run in runs], scorers)[0]
 
     ours = columns_of([str(pack / f"{name}.zarr.zip") for name in RUNS])
     full = columns_of([str(small_benchmark / name) for name in RUNS])
