@@ -7,14 +7,14 @@ Scenes of a run of whole grids in which some clear cell is good. Each is rendere
 cloud saw it, with the noise of a stereo camera, depth in whole millimetres, and the true mask and pose.
 `predict` answers from that frame alone, from it with floor out of sight allowed, from up to three frames of
 which each further one looks where the answer before advises (`look_next`), and with a map of the house:
-"lidar" has what stands in a plane 0.2 m above the floor, "full" all that stands below the arm's mount. A plan
-is then made from the very pose. "answered": there was a best pose; "good": a plan was found, of all scenes.
+"lidar" has what stands in a plane 0.2 m above the floor, "full" all that stands below the arm's mount. Plans
+are then made from the very pose, as many draws as the run has. "answered": there was a best pose; "good":
+most draws found a plan, of all scenes.
 """
 
 from __future__ import annotations
 
 import argparse
-import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -22,10 +22,12 @@ from pathlib import Path
 import numpy as np
 
 from datagen.console.options import Sources
-from datagen.evaluation.arrival_outcomes import PLAN, Arrived, SceneTask, make_arrivals, read_outcomes
+from datagen.evaluation.arrival_outcomes import Arrived
+from datagen.evaluation.runs import draws_of
 from datagen.replaying import places_of
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
+from datagen.schemas.run_records import StageClock
 from datagen.schemas.shard_reading import SceneRows, read_scenes
 from datagen.schemas.specification import NoiseParams
 from datagen.train.baselines.rules import Proximity, ReachShare
@@ -38,11 +40,13 @@ from datagen.workers.bases.clearance import STEP_M, HouseObstacles
 from datagen.workers.geometry.planar import inside_polygon, signed_distances_to_convex
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.houses.house import House
+from datagen.workers.labels.arm_labelling import arm_in_scene
+from datagen.workers.labels.arrival_trial import try_arrival
 from datagen.workers.occupancy_map import FREE, OCCUPIED, UNKNOWN
 from datagen.workers.rendering import Camera
 from datagen.workers.rendering.embree import render_rays
 from datagen.workers.rendering.noise import add_noise
-from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_scene
+from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_candidates, reconstruct_scene
 from datagen.workers.world import open_world
 
 _RESOLUTION_M = 0.05
@@ -64,6 +68,7 @@ def main() -> None:
     run = Run.open(options.run)
     places = places_of(run, Sources(houses=options.houses, objects=options.objects))
     world = open_world(run.manifest.spec, *places)
+    draws = draws_of(options.run, [run.manifest.spec]) or 1
     scorers: list[Scorer] = [load_scorer(options.checkpoint), ReachShare(), Proximity()]
     good: dict[tuple[str, str], list[bool | None]] = {}
     names = tuple(scorer.name for scorer in scorers)
@@ -71,7 +76,8 @@ def main() -> None:
     asked = refused = 0
     for k, stored in enumerate(read_scenes(run, range(run.n // run.layout.candidates_per_scene))):
         clear = stored.samples["base_clearance_m"] > 0
-        if asked == options.scenes or not (stored.samples["label"][clear] == 1).any():
+        found = stored.samples["successes"][clear]
+        if asked == options.scenes or not (2 * found > draws).any():
             continue
         asked += 1
         scene = reconstruct_scene(world, stored.record)
@@ -90,9 +96,15 @@ def main() -> None:
             first = answers[scorer.name, _ALONE]
             answers[scorer.name, _ADVISED] = _advised(scorer, scene, first, robot, k)
         arrived = {key: _arrived(answer, stored) for key, answer in answers.items()}
-        outcomes = _planned(run, places, k, [each for each in arrived.values() if each is not None])
+        candidates, spec = reconstruct_candidates(stored.samples, scene), run.manifest.spec
+        arms = [arm_in_scene(scene, candidates, 0, spec, StageClock(), draw) for draw in range(draws)]
+        planned: dict[Arrived | None, bool | None] = {None: None}
+        for at in dict.fromkeys(each for each in arrived.values() if each is not None):
+            offset = at.x_m, at.y_m, at.yaw_rad
+            outcomes = [try_arrival(arm, candidates, at.candidate, offset, None, spec) for arm in arms]
+            planned[at] = 2 * outcomes.count("success") > draws
         for key, at in arrived.items():
-            good.setdefault(key, []).append(None if at is None else outcomes[at.key] == "success")
+            good.setdefault(key, []).append(planned[at])
         levels.setdefault(answers[names[0], _MAPPED].level, []).append(bool(good[names[0], _MAPPED][-1]))
         if options.pictures is not None:
             said = [good[name, _MAPPED][-1] for name in (names[0], names[-1])]
@@ -196,14 +208,6 @@ def _arrived(answer: Prediction, stored: SceneRows) -> Arrived | None:
     off, c, s = xy - stored.samples["base_xy_m"][near], np.cos(goal), np.sin(goal)
     turn = (yaw - goal + np.pi) % (2 * np.pi) - np.pi
     return Arrived(near, *(float(v) for v in (c * off[0] + s * off[1], c * off[1] - s * off[0], turn)))
-
-
-def _planned(run: Run, places: tuple[str, str, str], scene: int, arrived: list[Arrived]) -> dict[str, str]:
-    with tempfile.TemporaryDirectory() as folder:
-        spec, wanted = run.manifest.spec, tuple(sorted(set(arrived)))
-        task = SceneTask(run.storage.url, spec, *places, scene, PLAN, _SEED, folder, wanted)
-        make_arrivals(replace(task), lambda: False)
-        return read_outcomes(task.path)
 
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ class EvaluatedRun:
         return CANDIDATE_SETS[: min(widths[s.candidates.within] for s in self.specs)]
 
     def batches(self) -> Iterator[Batch[Array]]:
-        """Its candidates in stored order; where several draws were planned, good is what most of them call so."""
+        """Its candidates in stored order; of several draws of each, the label is that of most."""
         draws = draws_of(self.place, self.specs)
         for batch in self.stream.epoch(0):
             most = None if draws is None else 2 * batch.extra["successes"] > draws
@@ -65,7 +65,7 @@ class EvaluatedRun:
 
 
 def draws_of(place: str, specs: Sequence[Specification]) -> int | None:
-    """Draws that each candidate was planned with, None for one alone. InputError where merged parts differ."""
+    """Draws that each candidate was planned with, None for one. InputError where parts differ."""
     found = {spec.arm.draws for spec in specs if spec.arm is not None}
     if len(found) > 1:
         raise InputError(place, "arm.draws", "differs between its parts", "Evaluate the parts one by one")

@@ -27,7 +27,7 @@ def arrival_specification(spec: Specification, executes: bool) -> Specification:
     trial = (arm.trial or TrialParams()) if executes else None
     disturbance = (arm.disturbance or DisturbanceParams()) if executes else None
     return spec.model_copy(
-        update={"arm": arm.model_copy(update={"trial": trial, "disturbance": disturbance})}
+        update={"arm": arm.model_copy(update={"trial": trial, "disturbance": disturbance, "draws": None})}
     )
 
 
@@ -53,7 +53,8 @@ def try_arrival(
     if not at.is_within_reach(T_arrived):
         return "out_of_reach"
     index = int(candidates.index[row])
-    rng = generator(spec.seed, Stream.PATH, at.scene.index, at.scene.retry, index)
+    other = (at.draw,) if at.draw else ()
+    rng = generator(spec.seed, Stream.PATH, at.scene.index, at.scene.retry, index, *other)
     report = plan_candidate(at.planning, T_arrived, rng)
     if report.plan is None or world is None:
         return report.outcome

@@ -25,7 +25,7 @@ def small_benchmark(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the runs and of their definition, benchmark.json. Tests only read it."""
     folder = tmp_path_factory.mktemp("benchmark")
     (folder / "small.toml").write_text(GRID_CONFIG.format(side=SIDE) + OPEN_TOPS)
-    kinds = {"test": ["--candidates", "in-range", "--candidates-per-scene", "4"], "grids": []}
+    kinds = {"test": ["--candidates", "in-range", "--candidates-per-scene", "4"], "grids": ["--draws", "3"]}
     runs: dict[str, BenchmarkRun] = {}
     for seed, (name, kind) in enumerate(kinds.items()):
         out = folder / "runs" / name

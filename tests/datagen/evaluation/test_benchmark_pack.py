@@ -101,6 +101,15 @@ def test_scores_on_a_pack_are_those_of_its_scenes_in_the_runs(
     assert told["area_under_roc"]["value"] == pytest.approx(((higher > 0) + (higher == 0) / 2).mean())
 
 
+def test_good_is_what_most_draws_call_good(small_benchmark: Path, pack: Path) -> None:
+    for folder in (str(small_benchmark / "grids"), str(pack / "grids.zarr.zip")):
+        (run,) = open_evaluated_runs([folder])
+        rows = [(batch.label, batch.extra["successes"]) for batch in run.batches()]
+        label, successes = (np.concatenate(each) for each in zip(*rows, strict=True))
+        np.testing.assert_array_equal(label, successes >= 2)
+        assert 1 in successes  # of three: the candidate's own label may be 1
+
+
 def test_without_runs_the_pack_of_the_package_is_scored(
     pack: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -202,7 +211,8 @@ def test_a_pack_without_labels_is_read_but_not_scored(
     blind = packed(small_benchmark, tmp_path / "blind", "--without-labels")
     assert (blind / "benchmark.json").read_bytes() == (pack / "benchmark.json").read_bytes()
     for name in RUNS:
-        assert stored(pack, name).keys() - stored(blind, name).keys() == {"label"}
+        hidden = {"label", "successes"} if name == "grids" else {"label"}
+        assert stored(pack, name).keys() - stored(blind, name).keys() == hidden
     told = "test.zarr.zip: label: is not a field of the run"
     refused(["benchmark", "score", "proximity", "--runs", str(blind)], capsys, told)
 
