@@ -28,6 +28,7 @@ from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.transforms import pose, translation
 from datagen.workers.labels import arm_labelling, arm_sources, load_label_source
 from datagen.workers.labels.arm_labelling import arm_in_scene, draw_disturbances, try_candidate
+from datagen.workers.labels.arrival_trial import try_arrival
 from datagen.workers.motion import MotionPlan
 from datagen.workers.scenes import SettledScene
 from datagen.workers.trials import TrialResult
@@ -172,9 +173,13 @@ def test_draws_are_counted_and_the_first_is_stored(labelled: dict[str, Any]) -> 
     np.testing.assert_array_equal(columns["trials"], 3 * one["trials"])
     found = np.zeros(3, int)
     for draw in range(3):
-        arms = (arm_in_scene(at, candidates(at), row, spec, StageClock(), draw) for row in range(3))
+        arms = [arm_in_scene(at, candidates(at), row, spec, StageClock(), draw) for row in range(3)]
         plans = [try_candidate(arm, candidates(at), row, spec).plan for row, arm in enumerate(arms)]
         found += [plan is not None for plan in plans]
+        arrived = [
+            try_arrival(arm, candidates(at), row, (0.0, 0.0, 0.0), None, spec) for row, arm in enumerate(arms)
+        ]
+        assert [outcome == "success" for outcome in arrived] == [plan is not None for plan in plans]
         if draw:
             assert plans[0] is not None and plans[0].length_rad != one["path_length_rad"][0]
     np.testing.assert_array_equal(columns["successes"][:3], found)
