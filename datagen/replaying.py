@@ -49,7 +49,8 @@ def source_of(run: Run, given: Sources = AS_FOUND) -> Run:
     if not path:
         raise InputError(run.storage.url, "scenes_from", "is not in the run's manifest", fix)
     source = Run.open(path)
-    if source.manifest.spec.scenes_hash != run.manifest.spec.scenes_hash:
+    stored = run.manifest.spec.scenes_from
+    if stored is None or source.manifest.spec.scenes_hash != stored.spec_hash:
         raise InputError(path, "spec_hash", "has other scenes than this run", fix)
     return source
 

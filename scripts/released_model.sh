@@ -5,16 +5,17 @@
 #
 # Everything lies below FOLDER (build/model). Finished steps are skipped: the same command continues where it
 # stopped. DATAGEN_ASSETS names the folder that has ycb/ and procthor/. Sizes can be set from outside
-# (TOPS=600 MIX=600 EACH=600 VAL=600 EPOCHS=1 scripts/released_model.sh FOLDER).
+# (TOPS=600 MIX=600 HARD=600 EACH=600 VAL=600 EPOCHS=1 scripts/released_model.sh FOLDER).
 set -euo pipefail
 ROOT=$(realpath "$(dirname "$0")/..")
 . "$ROOT/scripts/campaign.sh"
 OUT=$(realpath -m "${1:-$ROOT/build/model}")
 TOPS=${TOPS:-30000}  # on open tops, of a scaled Panda
 MIX=${MIX:-40000}    # of that arm at places of all kinds
+HARD=${HARD:-40000}  # of that arm in scenes of which four in five are decisive
 EACH=${EACH:-8000}   # of each other arm there
 VAL=${VAL:-3000}
-EPOCHS=${EPOCHS:-12}
+EPOCHS=${EPOCHS:-10}
 OTHERS="fetch xarm7 tiago-pro ur5 stretch3"
 
 need_assets_and_programs
@@ -26,22 +27,27 @@ submit() { # NAME ROBOT LABELS SPLIT SEED [OPTION...]
     step "$name"
     datagen submit plan --robot "$robot" --n "$n" --split "$split" --seed "$seed" --candidates in-range \
         --candidates-per-scene 20 --out "$name" --houses "procthor:$ASSETS/procthor" --objects ycb:objects/train "$@"
+    [ "$split" = train ] || return 0
+    step "$name from another viewpoint"
+    datagen submit plan --scenes-from "$name" --view 1 --n "$n" --out "views/$name"
+    mixes+=("$name") views+=("views/$name")
 }
+mixes=() views=()
 
 [ -f objects/test/objects.json ] || datagen assets split "$ASSETS/ycb" objects
 printf '[scene]\nplaces = {}\n' > tops.toml
+printf '[scene]\ndecisive = 0.8\n' > decisive.toml
 submit val panda-scaled "$VAL" val 402
 submit mix-panda-scaled panda-scaled "$MIX" train 401
+submit hard-panda-scaled panda-scaled "$HARD" train 501 --config decisive.toml
 submit mix-tops panda-scaled "$TOPS" train 301 --config tops.toml
 seed=403
-mixes=(mix-panda-scaled mix-tops)
 for robot in $OTHERS; do
     submit "mix-$robot" "$robot" "$EACH" train "$seed"
-    mixes+=("mix-$robot")
     seed=$((seed + 1))
 done
 step training
-datagen train sim-only "${mixes[@]}" --val val --epochs "$EPOCHS" --model-config width=96 --model-config embedding=160 \
+datagen train sim-only "${mixes[@]}" "${views[@]}" --val val --epochs "$EPOCHS" --model-config width=96 --model-config embedding=160 \
     --model-config kinematics=true --seed 1 --encoded inputs --threads 1 --out model.ckpt
 step "the benchmark's runs"
 datagen benchmark make --houses "procthor:$ASSETS/procthor" --objects "ycb:$ASSETS/ycb" --out runs

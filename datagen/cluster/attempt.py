@@ -97,7 +97,8 @@ def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:
     with ends_job(every_input_error=True):
         refuse_other_code(task.code_digest)
         run, world = _open(task.run, task.spec.hash(), task.houses, task.objects, task.robot, task.probe)
-        scenes_run = _open_scenes_run(task.scenes_from, task.spec.scenes_hash) if task.scenes_from else None
+        stored = task.spec.scenes_from
+        scenes_run = None if stored is None else _open_scenes_run(task.scenes_from, stored.spec_hash)
     return run, world, scenes_run
 
 

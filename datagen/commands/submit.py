@@ -16,6 +16,7 @@ from datagen.configuration.stored_scenes import (
     open_stored_scenes,
     refuse_too_few,
     specify_again,
+    specify_view,
 )
 from datagen.console.command_lines import (
     absolute_source,
@@ -50,6 +51,8 @@ from datagen.workers.world import World, assemble_world, open_world
 
 # Options that --scenes-from decides.
 _OF_SCENES = ("--seed", "--split", "--candidates", "--candidates-per-scene")
+# Options that --view leaves as they were.
+_OF_LABELS = ("--config", "--robot", "--perturb", "--draws")
 _BUILTIN = (
     "Using built-in houses. For real ones: datagen assets fetch procthor-10k --out DIR, then "
     "--houses procthor:DIR/procthor"
@@ -84,6 +87,12 @@ class SubmitOptions(JobOptions):
     )
     scenes_from: Annotated[
         str | Path | None, _path("Run whose scenes and candidates are labelled again.")
+    ] = None
+    view: Annotated[
+        Whole | None,
+        option(
+            "With --scenes-from: keep labels, and observe the scenes from this other viewpoint.", LABELLED
+        ),
     ] = None
     candidates: Annotated[
         Literal["grid", "clear", "in-range"] | None,
@@ -203,6 +212,9 @@ def _specified(options: SubmitOptions, shown: Progress) -> tuple[Run | None, Man
     chosen = options.robot, options.perturb, options.draws
     surveys: Mapping[str, Survey] = {}
     if options.scenes_from is None:
+        if options.view is not None:
+            fix = "Give --scenes-from with the run whose scenes are observed"
+            raise InputError("--view", str(options.view), "has no scenes", fix)
         houses, objects = options.houses or "builtin", options.objects or "builtin"
         house_source, object_source = open_houses(houses), open_objects(objects)
         fields = {"seed": options.seed, "split": options.split, **_candidate_fields(options)}
@@ -222,7 +234,11 @@ def _specified(options: SubmitOptions, shown: Progress) -> tuple[Run | None, Man
             options.objects,
             {name: given[name] for name in _OF_SCENES if name in given},
         )
-        spec = specify_again(label_source, stored, config, *chosen)
+        if options.view is None:
+            spec = specify_again(label_source, stored, config, *chosen)
+        else:
+            kept = {name: given[name] for name in _OF_LABELS if name in given}
+            spec = specify_view(label_source, stored, kept, options.view)
         houses, objects = stored.houses, stored.objects
         world = open_world(spec, houses, objects, options.robot or stored.robot)
         refuse_unusable_engines(spec)

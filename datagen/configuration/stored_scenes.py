@@ -106,6 +106,26 @@ def specify_again(
     return spec
 
 
+def specify_view(
+    label_source: str, stored: StoredScenes, given: Mapping[str, Any], view: int
+) -> Specification:
+    """Return the stored run's specification with clouds from its `view`-th other viewpoint.
+
+    Labels stay as they are. Raises InputError for another label source, and for options `given` by name that
+    would change labels.
+    """
+    before = stored.run.manifest.spec
+    fix = "Omit it: scenes seen from another viewpoint keep their labels"
+    if label_source != before.label_source:
+        problem = f"is not that of {stored.run.storage.url} ({before.label_source})"
+        raise InputError("--view", label_source, problem, f"Submit {before.label_source}")
+    for option, value in given.items():
+        if value is not None:
+            raise InputError(option, str(value), "is given with --view", fix)
+    fields = before.model_dump(mode="json", exclude_none=True)
+    return validated(fields | {"scenes_from": {"spec_hash": before.scenes_hash, "view": view}}, "--view")
+
+
 def layout_again(spec: Specification, stored: StoredScenes, n: int) -> Layout:
     """The layout of a new run of n labels, in shards that the stored scenes fill."""
     per_scene = stored.run.layout.candidates_per_scene

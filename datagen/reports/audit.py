@@ -95,11 +95,13 @@ def _source(
 def _scenes_s(group: Sequence[Labels], runs: Sequence[Run]) -> float | None:
     """Core seconds of the scenes that others of the runs made for these; None where no run made them."""
     total = 0.0
-    for run in (each.run for each in group if each.run.manifest.spec.scenes_from):
+    for run in (each.run for each in group):
+        if (stored := run.manifest.spec.scenes_from) is None:
+            continue
         spending = account_for([run])
         if spending.useful.relabelled_s:
             continue  # its cost includes the scenes
-        made_by = [other for other in runs if other.manifest.spec_hash == run.manifest.spec.scenes_hash]
+        made_by = [other for other in runs if other.manifest.spec_hash == stored.spec_hash]
         if not made_by:
             return None
         maker = account_for(made_by[:1])

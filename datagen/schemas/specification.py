@@ -288,9 +288,11 @@ class ArmParams(Frozen):
 
 
 class ScenesFrom(Frozen):
-    """The run whose scenes and candidates are labelled again."""
+    """The run whose scenes and candidates are labelled again, or keep their labels and get other clouds."""
 
     spec_hash: str = Field(pattern=r"^[0-9a-f]{64}$")
+    # Number of the viewpoint from which scenes are observed; None for the clouds of that run.
+    view: int | None = Field(default=None, ge=1, le=1000)
 
 
 class VisibilityParams(Frozen):
@@ -373,5 +375,6 @@ class Specification(Frozen):
 
     @property
     def scenes_hash(self) -> str:
-        """Hash of the scenes and candidates: equal for runs that label the same ones."""
-        return self.scenes_from.spec_hash if self.scenes_from else self.hash()
+        """Hash of the scenes and candidates: equal for runs that label the same ones, from one viewpoint."""
+        stored = self.scenes_from
+        return stored.spec_hash if stored is not None and stored.view is None else self.hash()

@@ -24,9 +24,11 @@ from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import DECISIVE_SHARES, PLACE_KINDS, Specification
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import LabelSource, load_label_source
+from datagen.workers.rendering import Camera
+from datagen.workers.rendering.cloud import Cloud
 from datagen.workers.scenes import Scene
-from datagen.workers.scenes.generate import generate_scene
-from datagen.workers.scenes.placement import draw_place
+from datagen.workers.scenes.generate import generate_scene, observe
+from datagen.workers.scenes.placement import SceneRejected, draw_place
 from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_candidates, reconstruct_scene
 from datagen.workers.watched_clock import WatchedClock
 from datagen.workers.world import World
@@ -74,8 +76,14 @@ def run_shard(
             record = scene_row(scene, spec) | drawn
         else:
             scene = _stored_scene(world, index, rows, clock)
-            candidates = reconstruct_candidates(rows.samples, scene)
-            labelled, record = source.label(scene, candidates, spec, clock), rows.record
+            candidates, record = reconstruct_candidates(rows.samples, scene), rows.record
+            if spec.scenes_from is None or (view := spec.scenes_from.view) is None:
+                labelled = source.label(scene, candidates, spec, clock)
+            else:  # no label depends on that camera
+                with clock.stage("observe"):
+                    record = _seen_again(scene, spec, rows, view)
+                own = candidate_columns(index, candidates, spec_hash, source)
+                labelled = {name: column for name, column in rows.samples.items() if name not in own}
         scene_rows.append(record)
         sample_blocks.append(candidate_columns(index, candidates, spec_hash, source) | labelled)
         clock.labels = sum(len(block["label"]) for block in sample_blocks)
@@ -135,7 +143,7 @@ def good_share(candidates: SceneCandidates, labelled: Columns) -> float:
 
 def scene_row(scene: Scene, spec: Specification) -> dict[str, Any]:
     """The scene's record, by field name, without what depends on its labels."""
-    house, surface, camera, cloud = scene.house.house, scene.surface, scene.camera, scene.cloud
+    house, surface = scene.house.house, scene.surface
     # Rows have as many objects as the specification allows.
     free = 1 + spec.scene.n_clutter - len(scene.models)
     return {
@@ -160,15 +168,32 @@ def scene_row(scene: Scene, spec: Specification) -> dict[str, Any]:
         "penetration_m": scene.settled.penetration_m,
         "target_center_m": scene.target_center_m,
         "target_radius_m": scene.rays.radii_m[0],
+        **_seen_row(scene.camera, scene.target_visible_fraction, scene.cloud),
+    }
+
+
+def _seen_row(camera: Camera, share: float, cloud: Cloud) -> dict[str, Any]:
+    """The fields of a scene's record that depend on where it was observed from."""
+    return {
         "T_world_camera": camera.T_world_camera,
         "intrinsics_px": (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px),
         "image_size_px": (camera.width_px, camera.height_px),
-        "target_visible_fraction": scene.target_visible_fraction,
+        "target_visible_fraction": share,
         "points_m": cloud.points_m,
         "rgb": cloud.rgb,
         "target_mask": cloud.target_mask,
         "n_points": cloud.n,
     }
+
+
+def _seen_again(scene: ReconstructedScene, spec: Specification, rows: SceneRows, view: int) -> dict[str, Any]:
+    """The stored record as seen from another viewpoint, or as it is where no other sees the target."""
+    item = (scene.index, scene.retry, view)
+    try:
+        seen = observe(scene.house, str(rows.record["room_id"]), scene.geometry, scene.rays, spec, item)
+    except SceneRejected:
+        return dict(rows.record)
+    return {**rows.record, **_seen_row(*seen)}
 
 
 def candidate_columns(

@@ -27,7 +27,7 @@ from datagen.workers.geometry.transforms import look_at
 from datagen.workers.houses.house import Room, Surface
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.rendering import Camera, Frame, SceneGeometry, load_renderer
-from datagen.workers.rendering.cloud import PixelCaster, caster_of, observe_cloud
+from datagen.workers.rendering.cloud import Cloud, PixelCaster, caster_of, observe_cloud
 from datagen.workers.rendering.embree import RayScene, cast_pixels
 from datagen.workers.rendering.noise import add_noise
 from datagen.workers.rendering.visibility import visible_pixels
@@ -138,19 +138,33 @@ def _try_scene(
 
     with clock.stage("observe"):
         rays = world.ray_scene(house, names, settled.T_world_object)
-        room = house.house.room(surface.room_id)
-        rng = generator(spec.seed, Stream.OBSERVE, index, retry)
-        camera, share = draw_viewpoint(
-            rays, room, house.obstacles, target_m, spec.observation, spec.candidates, rng
-        )
-        cast: PixelCaster = partial(cast_pixels, rays, camera)  # only the pixels that the cloud samples
-        if spec.observation.noise.enabled:  # it needs neighbouring pixels
-            geometry = SceneGeometry(house.house, models, settled.T_world_object)
-            noise_rng = generator(spec.seed, Stream.NOISE, index, retry)
-            cast = caster_of(render_frame(spec.observation, geometry, camera, noise_rng))
-        cloud = observe_cloud(cast, camera, 1, target_m, float(rays.radii_m[0]), spec.observation, rng)
-    scene = Scene(index, retry, redraws, house, surface, models, settled, rays, camera, share, cloud)
+        geometry = SceneGeometry(house.house, models, settled.T_world_object)
+        seen = observe(house, surface.room_id, geometry, rays, spec, (index, retry))
+    scene = Scene(index, retry, redraws, house, surface, models, settled, rays, *seen)
     return scene, candidates
+
+
+def observe(
+    house: PreparedHouse,
+    room_id: str,
+    geometry: SceneGeometry,
+    rays: RayScene,
+    spec: Specification,
+    item: tuple[int, ...],
+) -> tuple[Camera, float, Cloud]:
+    """A camera in the room, the share of the target that it sees, and the scene's cloud from there.
+
+    `item` is the scene's index and retry, and the number of the viewpoint where it is not the first. Raises
+    SceneRejected("no_viewpoint") as `draw_viewpoint`.
+    """
+    params, rng = spec.observation, generator(spec.seed, Stream.OBSERVE, *item)
+    room, target_m = house.house.room(room_id), geometry.T_world_object[0, :3, 3]
+    camera, share = draw_viewpoint(rays, room, house.obstacles, target_m, params, spec.candidates, rng)
+    cast: PixelCaster = partial(cast_pixels, rays, camera)  # only the pixels that the cloud samples
+    if params.noise.enabled:  # it needs neighbouring pixels
+        noise_rng = generator(spec.seed, Stream.NOISE, *item)
+        cast = caster_of(render_frame(params, geometry, camera, noise_rng))
+    return camera, share, observe_cloud(cast, camera, 1, target_m, float(rays.radii_m[0]), params, rng)
 
 
 def _reach_of(spec: Specification) -> ReachableSet | None:

@@ -19,6 +19,7 @@ from tests.workers.objects.toy_set import write_bundle
 SCENES = 6
 N = SCENES * PER_SCENE
 OWN = ("sample_id", "label_source", "label_version")  # what a run says of itself
+SEEN = {"T_world_camera", "target_visible_fraction", "points_m", "rgb", "target_mask", "n_points"}
 OTHER_RULE = "[heuristic]\nmu = 0.7\ndistance = 'mount-over-reach'\n"
 
 
@@ -82,6 +83,51 @@ def test_a_run_of_stored_scenes_is_itself_a_source_of_the_same_scenes(again: Pat
     assert specs[0].scenes_hash == specs[1].scenes_hash
     assert specs[0].heuristic == specs[1].heuristic  # what is not given is as in the source
     np.testing.assert_array_equal(arrays_of(third)["label"], arrays_of(again)["label"][: 2 * PER_SCENE])
+
+
+def test_another_viewpoint_changes_what_is_seen_and_no_label(source: Path, tmp_path: Path) -> None:
+    first, second, again = (tmp_path / name for name in ("first", "second", "again"))
+    for out, view, workers in ((first, "1", "0"), (second, "2", "0"), (again, "1", "2")):
+        arguments = again_arguments(source, out, N, "--view", view)
+        arguments[arguments.index("--workers") + 1] = workers
+        assert cli.run(arguments) == 0
+    before, one, two, three = map(arrays_of, (source, first, second, again))
+    assert {name for name in before if not np.array_equal(before[name], one[name])} <= SEEN | {"sample_id"}
+    cameras = np.stack([arrays["T_world_camera"] for arrays in (before, one, two)])
+    moved = (np.diff(cameras, axis=0) != 0).any(axis=(2, 3))
+    assert moved.mean() > 0.5  # a scene with one viewpoint keeps it
+    for name in one:
+        np.testing.assert_array_equal(one[name], three[name], err_msg=name)
+    assert cli.run(["verify", str(first), "--replay", "3"]) == 0
+    specs = [Run.open(place).manifest.spec for place in (source, first, second)]
+    assert len({spec.scenes_hash for spec in specs}) == 3
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (("--view", "1", "--draws", "2"), ("--draws: 2", "Omit it")),
+        (("--view", "1", "--config", "c.toml"), ("--config", "Omit it")),
+        (("--view", "0"), ("--view", "greater than or equal to 1")),
+    ],
+)
+def test_what_decides_labels_is_refused_with_another_viewpoint(
+    more: tuple[str, ...], words: tuple[str, ...], source: Path, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "c.toml").write_text("")
+    refused(again_arguments(source, tmp_path / "run", N, *more), capsys, *words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_viewpoint_needs_stored_scenes_with_these_labels(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = ["submit", "heuristic", "--n", "8", "--view", "1", "--out", str(tmp_path / "run")]
+    refused(new, capsys, "--view: 1", "Give --scenes-from")
+    other = [word.replace("heuristic", "plan") for word in again_arguments(source, tmp_path / "run", N)]
+    refused([*other, "--view", "1"], capsys, "--view: plan", "Submit heuristic")
 
 
 def test_more_than_the_source_has_is_refused_with_how_many_there_are(
