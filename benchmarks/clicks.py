@@ -128,8 +128,11 @@ def _box(asked: Bools) -> list[Box]:
 
 def clicks_on(asked: Bools) -> list[tuple[int, int]]:
     """The middle pixel (u, v) of an object, and those halfway to its four ends, inside its outline."""
-    inside = np.asarray(ndimage.distance_transform_edt(np.pad(asked, 1)))[1:-1, 1:-1]
-    v, u = np.nonzero(inside > 0.4 * inside.max())
+    cut = ndimage.find_objects(asked.astype(np.int8))[0]
+    inside = np.asarray(ndimage.distance_transform_edt(np.pad(asked[cut], 1)))[1:-1, 1:-1]
+    v, u = (
+        part + each.start for part, each in zip(np.nonzero(inside > 0.4 * inside.max()), cut, strict=True)
+    )
     at, half = np.stack([u, v], axis=1), np.array([u.mean(), v.mean()])
     ends = [at[k] for k in (u.argmin(), u.argmax(), v.argmin(), v.argmax())]
     near = [
