@@ -41,6 +41,7 @@ from datagen.workers.rendering.noise import add_noise
 
 Labels = npt.NDArray[np.int64]
 ROOM, LEAST_PX, CLICKS = 65535, 300, 5
+_WORDS = "right", "refused"  # at the start of verdicts
 
 
 def main() -> None:
@@ -74,14 +75,13 @@ def main() -> None:
                 mask = _selected(select, image, place, T)
                 spent.append(time.process_time() - began)
                 at = middle if options.boxes else place
-                said.append(f"{place} {_verdict(mask, image, labels, at)}")
+                said.append(f"{_verdict(mask, image, labels, at)} at {place}")
+            n, right, refused = len(said), *(sum(each.startswith(word) for each in said) for word in _WORDS)
             if label == ROOM:
-                counts[source][7:] += len(said), sum("refused" in each for each in said)
+                counts[source][7:] += n, refused
             else:
-                right, refused = (sum(word in each for each in said) for word in ("right", "refused"))
-                n = len(said)
                 counts[source][1:7] += 1, right == n, n, right, refused, n - right - refused
-            if options.each and not all(("refused" if label == ROOM else "right") in each for each in said):
+            if options.each and (refused if label == ROOM else right) < n:
                 print(f"{source} {name} {label}: {'; '.join(said)}")
     head = ("frames", "objects", "all right", "clicks", "right", "refused", "wrong", "on room", "refused")
     print("".join(["source".ljust(24), *(word.rjust(10) for word in head)]))
@@ -128,8 +128,11 @@ def _box(asked: Bools) -> list[Box]:
 
 def clicks_on(asked: Bools) -> list[tuple[int, int]]:
     """The middle pixel (u, v) of an object, and those halfway to its four ends, inside its outline."""
-    inside = np.asarray(ndimage.distance_transform_edt(np.pad(asked, 1)))[1:-1, 1:-1]
-    v, u = np.nonzero(inside > 0.4 * inside.max())
+    cut = ndimage.find_objects(asked.astype(np.int8))[0]
+    inside = np.asarray(ndimage.distance_transform_edt(np.pad(asked[cut], 1)))[1:-1, 1:-1]
+    v, u = (
+        part + each.start for part, each in zip(np.nonzero(inside > 0.4 * inside.max()), cut, strict=True)
+    )
     at, half = np.stack([u, v], axis=1), np.array([u.mean(), v.mean()])
     ends = [at[k] for k in (u.argmin(), u.argmax(), v.argmin(), v.argmax())]
     near = [

@@ -1,8 +1,9 @@
 """Which pixels belong to the object at a clicked one: a small U-Net over a crop of metric scale, in NumPy.
 
-The crop has 96 x 96 cells, each 4.5 mm wide at the clicked pixel's depth. Its channels are depth, height and
-distance along the view relative to the clicked point, normals, whether there is depth, colour, and how near a
-cell is to the click. Directions are those of an upright frame that looks where the camera does.
+The crop has 96 x 96 cells, each 4.5 mm wide at the clicked pixel's depth. It is turned by quarters until its
+top is nearest to up. Its channels are depth, height and distance along the view relative to the clicked
+point, normals, whether there is depth, colour, and how near a cell is to the click. Directions are those of
+an upright frame that looks where the camera does.
 `scripts/click_network.py` trains it on rendered scenes.
 """
 
@@ -79,7 +80,13 @@ def object_logits(image: RgbdImage, pixel: tuple[int, int], T_world_camera: F64)
     (u, v), (h, w), p = pixel, image.depth_m.shape, image.pinhole
     z = float(image.depth_m[v, u])
     ray = np.array([(u - p.cx_px) / p.fx_px * z, (v - p.cy_px) / p.fy_px * z, z])
-    logits = network_logits(channels(*crop_at(image, pixel), ray, T_world_camera[:3, :3]), _weights())
+    R, quarter = T_world_camera[:3, :3], np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    turns = int(np.argmax((-R[2, 1], R[2, 0], R[2, 1], -R[2, 0])))
+    away_m, rgb, known = (_turned(part, turns) for part in crop_at(image, pixel))
+    turn = np.linalg.matrix_power(quarter, turns)
+    logits = _turned(
+        network_logits(channels(away_m, rgb, known, turn @ ray, R @ turn.T), _weights()), -turns % 4
+    )
     at = [
         (np.arange(n) - k) * z / (CELL_M * f) + CELLS // 2 for n, k, f in ((h, v, p.fy_px), (w, u, p.fx_px))
     ]
@@ -88,6 +95,11 @@ def object_logits(image: RgbdImage, pixel: tuple[int, int], T_world_camera: F64)
     places = np.meshgrid(at[0][rows], at[1][columns], indexing="ij")
     found[np.ix_(rows, columns)] = ndimage.map_coordinates(logits, places, order=1)
     return found
+
+
+def _turned(part: npt.NDArray[Any], turns: int) -> npt.NDArray[Any]:
+    """A crop (N, N, ...) after quarter turns, counterclockwise, about the clicked cell."""
+    return np.roll(np.rot90(part, turns), (turns in (1, 2), turns in (2, 3)), (0, 1))
 
 
 @lru_cache(maxsize=1)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import nn
 
-from datagen.train.prediction.click_network import CELLS, CHANNELS, channels, network_logits
+from datagen.train.prediction.click_network import CELLS, CHANNELS, channels, network_logits, object_logits
+from datagen.train.prediction.frames import Pinhole, RgbdImage
 from scripts.click_network import Network, folded
 
 
@@ -46,3 +49,19 @@ def test_a_mirrored_picture_has_mirrored_channels() -> None:
     found = channels(mirror(away_m, 1), mirror(rgb, 1), mirror(known, 1), ray, R)
     inner = np.s_[:, 2:-2, 3:-3]
     assert np.allclose(found[inner], wanted[inner], atol=1e-5)
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_a_turned_camera_sees_the_same_object(turns: int) -> None:
+    rng, down, size = np.random.default_rng(0), 0.9, 161
+    depth_m = rng.uniform(0.9, 1.1, (size, size)).astype(np.float32)
+    rgb = rng.integers(0, 255, (size, size, 3), dtype=np.uint8)
+    T = np.eye(4)
+    T[:3, :3] = [[1, 0, 0], [0, -np.sin(down), np.cos(down)], [0, -np.cos(down), -np.sin(down)]]
+    middle = size // 2
+    pinhole = Pinhole(400.0, 400.0, middle, middle)
+    wanted = object_logits(RgbdImage(rgb, depth_m, pinhole, None), (middle, middle), T)
+    T[:3, :3] = T[:3, :3] @ Rotation.from_euler("z", 90 * turns, degrees=True).as_matrix()
+    picture = RgbdImage(np.rot90(rgb, turns), np.rot90(depth_m, turns), pinhole, None)
+    found = np.rot90(object_logits(picture, (middle, middle), T), -turns)
+    assert np.median(np.abs(found - wanted)) < 0.02 * wanted.std()
