@@ -121,6 +121,10 @@ class Film:
     @cached_property
     def views(self) -> tuple[View, View]:
         """The far view of the whole trial, and the near one of the grasp."""
+        return self.view(WIDE_PX), self.view(NEAR_PX, is_near=True)
+
+    def view(self, size_px: tuple[int, int], is_near: bool = False) -> View:
+        """The far or the near view, for images of `size_px`, width and height."""
         recording, objects = self.recording, len(self.scene.models)
         named, last = {words: row for row, words in self.moments}, len(recording.phase) - 1
         shown = sorted({0, named.get("on the way", 0), named.get("at the grasp", (last + 1) // 2), last})
@@ -136,10 +140,9 @@ class Film:
         house, ahead = self.scene.house.house, self.T_world_base[:3, 0]
         wide: Groups = ((arm, 1.0), (hand, 1.5), ((0,), 1.5))
         near: Groups = ((hand, 1.0), ((0,), 1.0))
-        return (
-            _best_view(house, stages, wide, around_m, ahead, _WIDE_M, WIDE_PX),
-            _best_view(house, stages[-2:], near, grasp_m, ahead, _NEAR_M, NEAR_PX),
-        )
+        if is_near:
+            return _best_view(house, stages[-2:], near, grasp_m, ahead, _NEAR_M, size_px)
+        return _best_view(house, stages, wide, around_m, ahead, _WIDE_M, size_px)
 
     def pictures(self, row: int, sharpness: int) -> tuple[Image.Image, Image.Image]:
         """The far and the near view of one moment."""
