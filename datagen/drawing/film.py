@@ -89,9 +89,8 @@ class View:
         pixels = _around(stage, camera)
         front, empty_m = cast_pixels(stage, camera, pixels), self._empty.depth_m[pixels]
         nearer = (front.depth_m > 0) & ((empty_m == 0) | (front.depth_m < empty_m))
-        flat = self._empty.rgb.copy()
-        flat[pixels[nearer]] = front.rgb[nearer]
-        rgb = flat.reshape(h, w, 3)
+        rgb = self._empty.rgb.reshape(h, w, 3).copy()
+        rgb.reshape(-1, 3)[pixels[nearer]] = front.rgb[nearer]
         if is_outlined:
             target = np.zeros((h, w), np.bool_)
             target.flat[pixels[nearer & (front.body == 1)]] = True

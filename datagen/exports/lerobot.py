@@ -1,7 +1,7 @@
 """Executed trials as a LeRobot data set, version 3.0: one episode per candidate whose plan was executed.
 
-Trials are executed again and drawn. An episode is the execution that decided the label, at the trials' control
-rate. Layout: huggingface.co/docs/lerobot/lerobot-dataset-v3.
+Trials are executed again and drawn. An episode is the execution that decided the label, at the trials'
+control rate. Layout: huggingface.co/docs/lerobot/lerobot-dataset-v3.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def _scene(
             | {name: int(rows.samples[name][row]) for name in ("candidate_index", "label")}
             | {"camera_pose": _poses(inverse(again.T_world_base) @ view.T[None])[0].tolist()}
             | {"camera_focal_px": view.camera(1).fx_px}
-            | {f"stats/{name}/{key}": v for name, of in stats.items() for key, v in _plain(name, of).items()}
+            | {f"stats/{name}/{key}": v.tolist() for name, of in stats.items() for key, v in of.items()}
         )
         start, filmed = start + length, filmed + length
         frames.append(columns)
@@ -118,14 +118,13 @@ def _trials(source: ExportSource, run: Run, rows: SceneRows) -> Iterator[tuple[i
 
 
 def _film(film: Film, view: View, video: Video) -> Stats:
-    """Append each frame's picture to the video; statistics of their channels, in shares of white."""
+    """Append each frame's picture; statistics (3, 1, 1) of every second row and column, as LeRobot's are."""
     parts: list[Stats] = []
     for row in range(len(film.recording.time_s)):
-        picture = view.picture(film.stage(row), 1)
-        video.add(picture)
-        # Every second pixel, as LeRobot does for pictures of this size.
+        video.add(picture := view.picture(film.stage(row), 1))
         parts.append(_stats(np.asarray(picture)[::2, ::2].reshape(-1, 3) / 255))
-    return {**_joined_stats(parts), "count": np.array([len(parts)])}
+    joined = _joined_stats(parts)
+    return {name: joined[name].reshape(3, 1, 1) for name in _SUMS[:4]} | {"count": np.array([len(parts)])}
 
 
 def _frames(again: Retrial, fps: float) -> dict[str, Array]:
@@ -158,16 +157,10 @@ def _stats(values: Array) -> Stats:
 def _joined_stats(parts: Sequence[Stats]) -> Stats:
     """The statistics of all values from those of their parts."""
     low, high, mean, std, count = (np.array([part[name] for part in parts], np.float64) for name in _SUMS)
-    weight = count / count.sum()
+    weight = (count / count.sum()).reshape(-1, *[1] * (mean.ndim - 1))
     middle = (weight * mean).sum(0)
     spread = np.sqrt((weight * (std**2 + (mean - middle) ** 2)).sum(0))
     return dict(zip(_SUMS, (low.min(0), high.max(0), middle, spread, count.sum(0)), strict=True))
-
-
-def _plain(name: str, stats: Stats) -> dict[str, list[Any]]:
-    """Statistics as LeRobot writes them: those of pictures have the axes channel, row, column."""
-    shapes = {key: (-1, 1, 1) if name == _VIDEO and key != "count" else (-1,) for key in stats}
-    return {key: values.reshape(shapes[key]).tolist() for key, values in stats.items()}
 
 
 def _arrow(parts: Sequence[Array]) -> Any:
@@ -198,29 +191,17 @@ def _about(source: ExportSource, tasks: Sequence[str], made: Made) -> Iterator[N
         name: {"dtype": "float32", "shape": [len(of)], "names": of} for name, of in names.items()
     }
     features |= {name: {"dtype": of, "shape": [1], "names": None} for name, of in _DTYPES.items()}
-    (width, height), fps = _SIZE_PX, _fps(run)
-    about_video = {
-        "height": height,
-        "width": width,
-        "codec": CODEC,
-        "pix_fmt": PIXELS,
-        "fps": fps,
-        "channels": 3,
-    }
-    features[_VIDEO] = {
-        "dtype": "video",
-        "shape": [height, width, 3],
-        "names": ["height", "width", "channels"],
-    }
-    features[_VIDEO]["info"] = {f"video.{key}": value for key, value in about_video.items()}
-    features[_VIDEO]["info"] |= {"video.is_depth_map": False, "has_audio": False}
+    fps, sizes = _fps(run), dict(zip(("height", "width", "channels"), (*_SIZE_PX[::-1], 3), strict=True))
+    features[_VIDEO] = {"dtype": "video", "shape": [*sizes.values()], "names": [*sizes]}
+    video = sizes | {"codec": CODEC, "pix_fmt": PIXELS, "fps": fps, "is_depth_map": False}
+    features[_VIDEO]["info"] = {"has_audio": False} | {f"video.{key}": video[key] for key in video}
     stats: dict[str, Stats] = {}
     for file in made.files:
         if file.path.startswith("meta/episodes/"):
             table = pq.read_table(pa.BufferReader(made.storage.get(file.path, MAX_FILE_BYTES)))
             for name in features:
                 columns = zip(*(table[f"stats/{name}/{key}"].to_pylist() for key in _SUMS), strict=True)
-                parts = [dict(zip(_SUMS, map(np.ravel, each), strict=True)) for each in columns]
+                parts = [dict(zip(_SUMS, map(np.array, each), strict=True)) for each in columns]
                 stats[name] = _joined_stats([*([stats[name]] if name in stats else []), *parts])
     info = {"codebase_version": "v3.0", "robot_type": arm.robot, "fps": fps, "chunks_size": _CHUNK}
     info |= {"total_episodes": episodes, "total_frames": frames, "total_tasks": len(tasks)}
@@ -229,7 +210,7 @@ def _about(source: ExportSource, tasks: Sequence[str], made: Made) -> Iterator[N
     info["video_path"] = f"videos/{{video_key}}/{_PATH}.mp4"
     info |= {key: source.about[key] for key in ("license", "acknowledgement")}
     yield NewFile("meta/info.json", json.dumps(info, indent=1).encode())
-    plain = {name: _plain(name, of) for name, of in stats.items()}
+    plain = {name: {key: value.tolist() for key, value in of.items()} for name, of in stats.items()}
     yield NewFile("meta/stats.json", json.dumps(plain, indent=1).encode())
     # The tasks are the index of a pandas table.
     types = {"task": ("unicode", "object"), "task_index": ("int64", "int64")}

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import io
 from fractions import Fraction
-from typing import TYPE_CHECKING
 
 import av
+from PIL.Image import Image
 
-if TYPE_CHECKING:
-    from PIL.Image import Image
+from datagen.schemas.errors import InputError
 
 CODEC, PIXELS = "h264", "yuv420p"
 # Few pictures between key frames, since readers draw frames at random; no pictures that need later ones.
@@ -17,12 +16,16 @@ _OPTIONS = {"g": "10", "bf": "0", "crf": "23"}
 
 
 class Video:
-    """A video of equally spaced pictures; equal pictures give equal bytes."""
+    """A video of equally spaced pictures; equal ones give equal bytes. InputError without an encoder."""
 
     def __init__(self, size_px: tuple[int, int], fps: float) -> None:
         self._data = io.BytesIO()
         self._container = av.open(self._data, "w", format="mp4")
-        self._stream = self._container.add_stream("libx264", Fraction(fps).limit_denominator(), _OPTIONS)
+        try:
+            self._stream = self._container.add_stream("libx264", Fraction(str(fps)), options=_OPTIONS)
+        except ValueError as error:
+            fix = "Install the extra export with PyAV's own wheel: pip install --force-reinstall av"
+            raise InputError("av", "libx264", "is not an encoder of this build", fix) from error
         self._stream.width, self._stream.height = size_px
         self._stream.pix_fmt = PIXELS
         self._stream.codec_context.thread_count = 1  # else bytes depend on the number of cores
