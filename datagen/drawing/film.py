@@ -16,7 +16,7 @@ from scipy.ndimage import binary_erosion
 from datagen.display.styles import PHASE_COLOURS, TARGET
 from datagen.drawing.posed_robot import RobotBodies
 from datagen.workers.geometry.mesh import F64, Mesh, concatenate
-from datagen.workers.geometry.transforms import look_at
+from datagen.workers.geometry.transforms import inverse, look_at
 from datagen.workers.houses.house import House, StaticBody
 from datagen.workers.rendering import Camera, Pixels, pixel_directions
 from datagen.workers.rendering.embree import RayMesh, RayScene, cast_pixels, occluded, ray_mesh
@@ -83,15 +83,17 @@ class View:
         """The house with the bodies of a stage; `sharpness` is the number of rays per pixel and axis."""
         camera = self.camera(sharpness)
         h, w = camera.height_px, camera.width_px
-        pixels = np.arange(h * w)
         if self._empty is None or len(self._empty.rgb) != h * w:
             nothing = RayScene(self.house, [], np.zeros(0), np.zeros((0, 4, 4)))
-            self._empty = cast_pixels(nothing, camera, pixels)
-        empty, front = self._empty, cast_pixels(stage, camera, pixels)
-        nearer = (front.depth_m > 0) & ((empty.depth_m == 0) | (front.depth_m < empty.depth_m))
-        rgb = np.where(nearer[:, None], front.rgb, empty.rgb).reshape(h, w, 3)
+            self._empty = cast_pixels(nothing, camera, np.arange(h * w))
+        pixels = _around(stage, camera)
+        front, empty_m = cast_pixels(stage, camera, pixels), self._empty.depth_m[pixels]
+        nearer = (front.depth_m > 0) & ((empty_m == 0) | (front.depth_m < empty_m))
+        rgb = self._empty.rgb.reshape(h, w, 3).copy()
+        rgb.reshape(-1, 3)[pixels[nearer]] = front.rgb[nearer]
         if is_outlined:
-            target = (nearer & (front.body == 1)).reshape(h, w)
+            target = np.zeros((h, w), np.bool_)
+            target.flat[pixels[nearer & (front.body == 1)]] = True
             inside = np.asarray(binary_erosion(target, iterations=sharpness), np.bool_)
             rgb[target & ~inside] = ImageColor.getrgb(TARGET.colour)
         return Image.fromarray(rgb).reduce(sharpness)
@@ -121,6 +123,10 @@ class Film:
     @cached_property
     def views(self) -> tuple[View, View]:
         """The far view of the whole trial, and the near one of the grasp."""
+        return self.view(WIDE_PX), self.view(NEAR_PX, is_near=True)
+
+    def view(self, size_px: tuple[int, int], is_near: bool = False) -> View:
+        """The far or the near view, for images of `size_px`, width and height."""
         recording, objects = self.recording, len(self.scene.models)
         named, last = {words: row for row, words in self.moments}, len(recording.phase) - 1
         shown = sorted({0, named.get("on the way", 0), named.get("at the grasp", (last + 1) // 2), last})
@@ -136,10 +142,9 @@ class Film:
         house, ahead = self.scene.house.house, self.T_world_base[:3, 0]
         wide: Groups = ((arm, 1.0), (hand, 1.5), ((0,), 1.5))
         near: Groups = ((hand, 1.0), ((0,), 1.0))
-        return (
-            _best_view(house, stages, wide, around_m, ahead, _WIDE_M, WIDE_PX),
-            _best_view(house, stages[-2:], near, grasp_m, ahead, _NEAR_M, NEAR_PX),
-        )
+        if is_near:
+            return _best_view(house, stages[-2:], near, grasp_m, ahead, _NEAR_M, size_px)
+        return _best_view(house, stages, wide, around_m, ahead, _WIDE_M, size_px)
 
     def pictures(self, row: int, sharpness: int) -> tuple[Image.Image, Image.Image]:
         """The far and the near view of one moment."""
@@ -289,6 +294,19 @@ def _visible(house: RayMesh, stages: Sequence[RayScene], groups: Groups, probe: 
             if alone.any():
                 total += weight * float(np.isin(body[alone], k).mean())
     return total / len(stages)
+
+
+def _around(stage: RayScene, camera: Camera) -> npt.NDArray[np.int64]:
+    """Pixels of the rectangles around the bodies' images; all where one is beside or behind the camera."""
+    shown = np.zeros((camera.height_px, camera.width_px), np.bool_)
+    for rays, T in zip(stage.objects, inverse(camera.T_world_camera) @ stage.T_world_object, strict=True):
+        corners_m = rays.around_m @ T[:3, :3].T + T[:3, 3]
+        if corners_m[:, 2].min() < 1e-3:
+            return np.arange(shown.size)
+        at_px = camera.fx_px * corners_m[:, :2] / corners_m[:, 2:] + (camera.cx_px, camera.cy_px)
+        (left, top), (right, bottom) = np.maximum([at_px.min(0) - 1, at_px.max(0) + 1], 0).astype(int)
+        shown[top:bottom, left:right] = True
+    return np.flatnonzero(shown)
 
 
 def _cubes(centres_m: F64, half_m: float) -> F64:

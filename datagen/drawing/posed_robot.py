@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -46,6 +47,7 @@ class RobotBodies:
         return np.flatnonzero(self.finger).tolist()
 
 
+@lru_cache(maxsize=1)  # trials of one scene mostly have one robot
 def robot_bodies(robot: Robot, pedestal_radius_m: float) -> RobotBodies:
     """The robot's bodies, with a pedestal for robots without a base of their own."""
     palm = robot.first_hand_link

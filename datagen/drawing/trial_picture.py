@@ -23,7 +23,7 @@ from datagen.workers.motion import MotionPlan
 from datagen.workers.motion.path_search import dense
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes import SettledScene
-from datagen.workers.scenes.reconstruct import reconstruct_candidates
+from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_candidates
 from datagen.workers.trials import Recording, TrialResult
 
 _STEP_S = 0.05  # between the moments of a plan that was not executed
@@ -40,6 +40,11 @@ class Retrial:
     result: TrialResult | None  # the execution to show
     recording: Recording
 
+    def film(self, scene: ReconstructedScene, spec: Specification) -> Film:
+        """The trial to be drawn in its scene."""
+        bodies = robot_bodies(self.robot, float(spec.candidates.radius_of_base_m(self.robot.reach_m)))
+        return Film(scene, bodies, self.T_world_base, self.recording, filmstrip_moments(self.recording))
+
 
 def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
     """Draw a candidate's trial as a filmstrip, or an animation where `out` is a .gif; None: the best success.
@@ -50,9 +55,7 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
     candidates = reconstruct_candidates(shown.samples, shown.recalled)
     again = try_again(shown.recalled, candidates, row, shown.spec)
     outcome, robot = again.trial.outcome, again.robot
-    bodies = robot_bodies(robot, float(shown.spec.candidates.radius_of_base_m(robot.reach_m)))
-    moments = filmstrip_moments(again.recording)
-    film = Film(shown.recalled, bodies, again.T_world_base, again.recording, moments)
+    film = again.film(shown.recalled, shown.spec)
     moving = out.suffix.lower() == ".gif"
     if moving and not film.moves:
         problem = f"candidate {row} ended as {outcome} before the arm moved: there is nothing to animate"

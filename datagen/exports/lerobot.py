@@ -1,7 +1,7 @@
 """Executed trials as a LeRobot data set, version 3.0: one episode per candidate whose plan was executed.
 
-Trials are executed again, which takes about as long as the labels did. An episode is the execution that
-decided the label, at the trials' control rate. Layout: huggingface.co/docs/lerobot/lerobot-dataset-v3.
+Trials are executed again and drawn. An episode is the execution that decided the label, at the trials'
+control rate. Layout: huggingface.co/docs/lerobot/lerobot-dataset-v3.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
+from datagen.drawing.film import Film, View
 from datagen.drawing.trial_picture import Retrial, try_again
 from datagen.exports.export_run import ExportSource, Made, NewFile, Step, scene_key
+from datagen.exports.mp4 import CODEC, PIXELS, Video
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import OUTCOMES, SceneRows
 from datagen.schemas.run import Run
@@ -28,9 +30,10 @@ from datagen.workers.robots import open_robot
 from datagen.workers.scenes.reconstruct import reconstruct_candidates
 
 _CHUNK = 1000  # files in a folder
-_PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+_VIDEO, _SIZE_PX = "observation.images.exterior", (320, 240)
 _EXECUTED = np.array([stage == "execute" for stage in OUTCOMES.values()])
-_POSE = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]  # of the target, in the frame of the arm's mount
+_POSE = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]  # in the frame of the arm's mount
 _SUMS: tuple[str, ...] = ("min", "max", "mean", "std", "count")
 # Features of one value.
 _DTYPES = {"next.done": "bool", "next.success": "bool", "timestamp": "float32"} | dict.fromkeys(
@@ -69,53 +72,66 @@ def _scene(
     source: ExportSource, tasks: Sequence[str], number: int, position: int, made: Made
 ) -> Iterator[NewFile]:
     ((run, rows),) = source.scenes(position, position + 1)
-    task, frames, episodes = _task(rows.record["object_name"][0]), list[dict[str, Array]](), list[Any]()
+    task = _task(rows.record["object_name"][0])
+    frames, episodes, fps, filmed = list[dict[str, Array]](), list[Any](), _fps(run), 0
     (number_of, start), (chunk, file) = made.sums("episodes", "frames"), divmod(number, _CHUNK)
-    for row, again in _trials(source, run, rows):
-        columns = _frames(again, _fps(run))
+    video, at = Video(_SIZE_PX, fps), {"chunk_index": chunk, "file_index": file}
+    for row, again, film in _trials(source, run, rows):
+        columns, view = _frames(again, fps), film.view(_SIZE_PX)
         length, episode = len(columns["action"]), number_of + len(episodes)
         columns |= {"index": np.arange(start, start + length), "episode_index": np.full(length, episode)}
         columns["task_index"] = np.full(length, tasks.index(task))
+        stats = {name: _stats(values) for name, values in columns.items()}
+        stats[_VIDEO] = _film(film, view, video)
+        times = {"from_timestamp": filmed / fps, "to_timestamp": (filmed + length) / fps}
         episodes.append(
             {"episode_index": episode, "tasks": [task], "length": length, "dataset_from_index": start}
-            | {"data/chunk_index": chunk, "data/file_index": file}
-            | {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
+            | {f"{part}/{key}": v for part in ("data", "meta/episodes") for key, v in at.items()}
+            | {f"videos/{_VIDEO}/{key}": v for key, v in (at | times).items()}
             | {"dataset_to_index": start + length, "outcome": again.trial.outcome}
             | {"scene_id": scene_key(run.manifest.spec_hash, int(rows.record["scene_index"]))}
             | {name: int(rows.samples[name][row]) for name in ("candidate_index", "label")}
-            | {
-                f"stats/{name}/{key}": v.tolist()
-                for name in columns
-                for key, v in _stats(columns[name]).items()
-            }
+            | {"camera_pose": _poses(inverse(again.T_world_base) @ view.T[None])[0].tolist()}
+            | {"camera_focal_px": view.camera(1).fx_px}
+            | {f"stats/{name}/{key}": v.tolist() for name, of in stats.items() for key, v in of.items()}
         )
-        start += length
+        start, filmed = start + length, filmed + length
         frames.append(columns)
     if episodes:
         table = pa.table({name: _arrow([each[name] for each in frames]) for name in frames[0]})
-        path, counts = _PATH.format(chunk_index=chunk, file_index=file), {"episodes": len(episodes)}
-        yield NewFile(f"data/{path}", _parquet(table))
-        yield NewFile(
-            f"meta/episodes/{path}", _parquet(pa.Table.from_pylist(episodes)), counts | {"frames": len(table)}
-        )
+        path, counts = _PATH.format(**at), {"episodes": len(episodes), "frames": len(table)}
+        yield NewFile(f"data/{path}.parquet", _parquet(table))
+        yield NewFile(f"videos/{_VIDEO}/{path}.mp4", video.finished())
+        yield NewFile(f"meta/episodes/{path}.parquet", _parquet(pa.Table.from_pylist(episodes)), counts)
 
 
-def _trials(source: ExportSource, run: Run, rows: SceneRows) -> Iterator[tuple[int, Retrial]]:
-    """The candidates of a scene whose plan was executed: row and repeated trial."""
+def _trials(source: ExportSource, run: Run, rows: SceneRows) -> Iterator[tuple[int, Retrial, Film]]:
+    """The candidates of a scene whose plan was executed: row, repeated trial, and its poses to draw."""
     executed = np.flatnonzero(_EXECUTED[rows.samples["outcome"]]).tolist()
     if executed:
         scene = source.rebuilt(run, rows.record)
         candidates = reconstruct_candidates(rows.samples, scene)
-        again = ((row, try_again(scene, candidates, row, run.manifest.spec)) for row in executed)
-        yield from (one for one in again if one[1].result is not None and len(one[1].recording.time_s))
+        for row in executed:
+            again = try_again(scene, candidates, row, run.manifest.spec)
+            if again.result is not None and len(again.recording.time_s):
+                yield row, again, again.film(scene, run.manifest.spec)
+
+
+def _film(film: Film, view: View, video: Video) -> Stats:
+    """Append each frame's picture; statistics (3, 1, 1) of every second row and column, as LeRobot's are."""
+    parts: list[Stats] = []
+    for row in range(len(film.recording.time_s)):
+        video.add(picture := view.picture(film.stage(row), 1))
+        parts.append(_stats(np.asarray(picture)[::2, ::2].reshape(-1, 3) / 255))
+    joined = _joined_stats(parts)
+    return {name: joined[name].reshape(3, 1, 1) for name in _SUMS[:4]} | {"count": np.array([len(parts)])}
 
 
 def _frames(again: Retrial, fps: float) -> dict[str, Array]:
     """The features of an episode's frames, by name. The action is the next state: what was reached."""
     recording = again.recording
     state = np.column_stack([recording.q_rad, recording.opening_m]).astype(np.float32)
-    poses = inverse(again.T_world_base) @ recording.T_world_object[:, 0]
-    target = np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
+    target = _poses(inverse(again.T_world_base) @ recording.T_world_object[:, 0])
     frame = np.arange(len(state))
     return {
         "observation.state": state,
@@ -128,6 +144,11 @@ def _frames(again: Retrial, fps: float) -> dict[str, Array]:
     }
 
 
+def _poses(T: Array) -> Array:
+    """Poses (N, 4, 4) as rows (N, 7) of `_POSE`."""
+    return np.column_stack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()])
+
+
 def _stats(values: Array) -> Stats:
     flat = values.astype(np.float64).reshape(len(values), -1)
     return {name: getattr(flat, name)(axis=0) for name in _SUMS[:4]} | {"count": np.array([len(flat)])}
@@ -136,7 +157,7 @@ def _stats(values: Array) -> Stats:
 def _joined_stats(parts: Sequence[Stats]) -> Stats:
     """The statistics of all values from those of their parts."""
     low, high, mean, std, count = (np.array([part[name] for part in parts], np.float64) for name in _SUMS)
-    weight = count / count.sum()
+    weight = (count / count.sum()).reshape(-1, *[1] * (mean.ndim - 1))
     middle = (weight * mean).sum(0)
     spread = np.sqrt((weight * (std**2 + (mean - middle) ** 2)).sum(0))
     return dict(zip(_SUMS, (low.min(0), high.max(0), middle, spread, count.sum(0)), strict=True))
@@ -170,6 +191,10 @@ def _about(source: ExportSource, tasks: Sequence[str], made: Made) -> Iterator[N
         name: {"dtype": "float32", "shape": [len(of)], "names": of} for name, of in names.items()
     }
     features |= {name: {"dtype": of, "shape": [1], "names": None} for name, of in _DTYPES.items()}
+    fps, sizes = _fps(run), dict(zip(("height", "width", "channels"), (*_SIZE_PX[::-1], 3), strict=True))
+    features[_VIDEO] = {"dtype": "video", "shape": [*sizes.values()], "names": [*sizes]}
+    video = sizes | {"codec": CODEC, "pix_fmt": PIXELS, "fps": fps, "is_depth_map": False}
+    features[_VIDEO]["info"] = {"has_audio": False} | {f"video.{key}": video[key] for key in video}
     stats: dict[str, Stats] = {}
     for file in made.files:
         if file.path.startswith("meta/episodes/"):
@@ -178,10 +203,11 @@ def _about(source: ExportSource, tasks: Sequence[str], made: Made) -> Iterator[N
                 columns = zip(*(table[f"stats/{name}/{key}"].to_pylist() for key in _SUMS), strict=True)
                 parts = [dict(zip(_SUMS, map(np.array, each), strict=True)) for each in columns]
                 stats[name] = _joined_stats([*([stats[name]] if name in stats else []), *parts])
-    info = {"codebase_version": "v3.0", "robot_type": arm.robot, "fps": _fps(run), "chunks_size": _CHUNK}
+    info = {"codebase_version": "v3.0", "robot_type": arm.robot, "fps": fps, "chunks_size": _CHUNK}
     info |= {"total_episodes": episodes, "total_frames": frames, "total_tasks": len(tasks)}
     info |= {"data_files_size_in_mb": 100, "video_files_size_in_mb": 200, "features": features}
-    info |= {"splits": {"train": f"0:{episodes}"}, "data_path": f"data/{_PATH}", "video_path": None}
+    info |= {"splits": {"train": f"0:{episodes}"}, "data_path": f"data/{_PATH}.parquet"}
+    info["video_path"] = f"videos/{{video_key}}/{_PATH}.mp4"
     info |= {key: source.about[key] for key in ("license", "acknowledgement")}
     yield NewFile("meta/info.json", json.dumps(info, indent=1).encode())
     plain = {name: {key: value.tolist() for key, value in of.items()} for name, of in stats.items()}

@@ -64,7 +64,7 @@ EXTRAS: dict[str, Extra] = {
     "tables": Extra(
         "open_dataset and candidates: xarray and pandas", {"pandas": "pandas", "xarray": "xarray"}
     ),
-    "export": Extra("export to parquet and huggingface", {"pyarrow": "pyarrow"}),
+    "export": Extra("export to parquet, huggingface and lerobot", {"av": "av", "pyarrow": "pyarrow"}),
     "rerun": Extra("export to rerun, view", {"pyarrow": "pyarrow", "rerun": "rerun-sdk"}),
     "pybullet": Extra("a second settler", {"pybullet": "pybullet"}),
 }

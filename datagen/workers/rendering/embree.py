@@ -44,7 +44,7 @@ class RayMesh:
         axes = np.array([axis for axis in product((-1.0, 0.0, 1.0), repeat=3) if any(axis)])
         points_m = self.mesh.vertices_m.astype(np.float64)
         faces = np.column_stack([axes, -(points_m @ axes.T).max(0) - _APART_M])
-        return HalfspaceIntersection(faces, (points_m.min(0) + points_m.max(0)) / 2).intersections
+        return HalfspaceIntersection(faces, points_m.mean(0)).intersections
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,12 +18,18 @@ from tests.workers.worlds import (
     TABLE_TOP_M,
     ball_model,
     box_model,
+    coloured,
     cylinder_model,
+    model_of,
     stage_with,
 )
 
 CENTRE = (ROOM_M[0] / 2, ROOM_M[1] / 2)
 BOX = box_model("target", (0.1, 0.1, 0.1))
+_ENDS_M = (0.1 * np.concatenate([np.zeros((1, 3)), np.eye(3)]) - 0.05).astype(np.float32)
+_SIDES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+# The middle of its bounding box lies outside.
+CORNER = model_of("corner", coloured(_ENDS_M, _SIDES, (180, 60, 60)), (_ENDS_M,), 0.3)
 BOARD = box_model("board", (0.01, 0.6, 0.6))
 
 
@@ -103,6 +109,7 @@ def test_blocks_of_rays_do_not_change_counts(monkeypatch: pytest.MonkeyPatch) ->
         ball_model("ball", 0.06),
         cylinder_model("long", 0.004, 0.3),
         box_model("sheet", (0.2, 0.1, 0.0)),
+        CORNER,
     ],
     ids=lambda model: model.name,
 )
