@@ -43,8 +43,8 @@ def try_arrival(
 
     The robot knows where it stands and plans from there. With a `world` the plan is executed in it; the robot
     knows neither its target pose nor its friction and mass, and its `T_base_moved` is not used. Depends on
-    these arguments alone. Without offset and world it equals the candidate's outcome in a run of `plan`, or in
-    the draw of `at`.
+    these arguments alone. Without offset and world it equals the candidate's outcome in a run of `plan`, or
+    in the draw of `at`.
     """
     T_arrived = at.base_pose(candidates, row) @ yaw_pose(offset[0], offset[1], 0.0, offset[2])
     if not fits_at(at, [T_arrived], candidates, row, spec)[0]:
