@@ -206,7 +206,9 @@ def test_the_code_of_the_documents_writes_scores_without_this_project(
 ) -> None:
     page = Path(__file__).parents[3] / "docs" / "results" / "benchmark.md"
     (code,) = [
-        block.split("```")[0] for block in page.read_text().split("```python\n")[1:] if "data.zarr" in block
+        code
+        for block in page.read_text().split("```python\n")[1:]
+        if "data.zarr" in (code := block.split("```")[0])
     ]
     assert len(code.strip().splitlines()) <= 12
     (tmp_path / "runs").symlink_to(small_benchmark)
