@@ -49,8 +49,9 @@ class EvaluatedRun:
         """Its candidates in stored order; of several draws of each, the label is that of most."""
         draws = draws_of(self.place, self.specs)
         for batch in self.stream.epoch(0):
-            most = None if draws is None else 2 * batch.extra["successes"] > draws
-            yield batch if most is None else replace(batch, label=most.astype(np.int64))
+            if draws is not None:
+                batch = replace(batch, label=(2 * batch.extra["successes"] > draws).astype(np.int64))
+            yield batch
 
     def record(self) -> dict[str, Any]:
         """Its entry in the report."""

@@ -94,6 +94,11 @@ class ArmInScene:
         (x, y), yaw_rad = candidates.base_xy_m[row].tolist(), float(candidates.base_yaw_rad[row])
         return yaw_pose(x, y, self.robot.base_height_m, yaw_rad)
 
+    def path_generator(self, index: int, spec: Specification) -> np.random.Generator:
+        """The generator of plans from candidate `index`, in this draw."""
+        other = (self.draw,) if self.draw else ()
+        return generator(spec.seed, Stream.PATH, self.scene.index, self.scene.retry, index, *other)
+
     def is_within_reach(self, T_world_base: F64) -> bool:
         """Whether the arm is long enough for any grasp of the target, in a straight line."""
         shoulder_m = T_world_base[:3, :3] @ self.robot.shoulder_m + T_world_base[:3, 3]
@@ -141,9 +146,8 @@ def try_candidate(
     T_world_base = at.base_pose(candidates, row)
     if not at.is_within_reach(T_world_base):
         return CandidateTrial("out_of_reach")
-    other = (at.draw,) if at.draw else ()
     index = int(candidates.index[row])
-    rng = generator(spec.seed, Stream.PATH, at.scene.index, at.scene.retry, index, *other)
+    rng = at.path_generator(index, spec)
     planning, clock = at.planning, at.clock
     with clock.stage("plan"):
         report = plan_candidate(planning, T_world_base, rng)

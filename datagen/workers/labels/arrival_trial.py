@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import DisturbanceParams, Specification, TrialParams
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.transforms import yaw_pose
@@ -53,9 +52,7 @@ def try_arrival(
         return "no_grasp"
     if not at.is_within_reach(T_arrived):
         return "out_of_reach"
-    index = int(candidates.index[row])
-    other = (at.draw,) if at.draw else ()
-    rng = generator(spec.seed, Stream.PATH, at.scene.index, at.scene.retry, index, *other)
+    rng = at.path_generator(int(candidates.index[row]), spec)
     report = plan_candidate(at.planning, T_arrived, rng)
     if report.plan is None or world is None:
         return report.outcome

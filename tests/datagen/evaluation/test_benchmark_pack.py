@@ -101,13 +101,13 @@ def test_scores_on_a_pack_are_those_of_its_scenes_in_the_runs(
     assert told["area_under_roc"]["value"] == pytest.approx(((higher > 0) + (higher == 0) / 2).mean())
 
 
-def test_good_is_what_most_draws_call_good(small_benchmark: Path, pack: Path) -> None:
+def test_runs_and_packs_of_draws_are_judged_by_their_successes(small_benchmark: Path, pack: Path) -> None:
     for folder in (str(small_benchmark / "grids"), str(pack / "grids.zarr.zip")):
         (run,) = open_evaluated_runs([folder])
         rows = [(batch.label, batch.extra["successes"]) for batch in run.batches()]
         label, successes = (np.concatenate(each) for each in zip(*rows, strict=True))
         np.testing.assert_array_equal(label, successes >= 2)
-        assert 1 in successes  # of three: the candidate's own label may be 1
+        assert {0, 3} <= set(successes.tolist())
 
 
 def test_without_runs_the_pack_of_the_package_is_scored(

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from datagen.evaluation.columns import gather
+from datagen.evaluation.runs import EvaluatedRun
 from datagen.schemas.errors import InputError
+from datagen.schemas.specification import ArmParams
 from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInputs
 from tests.datagen.evaluation.made_columns import make_columns
+from tests.made_runs import small_spec
 
 CELLS = 4
 
@@ -63,6 +67,20 @@ def make_batch(first: int, robots: list[int], per_robot: int = CELLS) -> Batch[A
         ids,
         extra,
     )
+
+
+def test_good_is_what_most_draws_call_good() -> None:
+    batch = make_batch(0, [2])  # whose own labels are all 1
+    batch = replace(batch, extra={**batch.extra, "successes": np.arange(8, dtype=np.int16) % 6})
+    stream: Any = SimpleNamespace(epoch=lambda _: iter([batch]))
+    specs = {draws: small_spec(label_source="plan", arm=ArmParams(draws=draws)) for draws in (None, 4, 5)}
+    good = {
+        draws: next(EvaluatedRun("run", (spec,), stream).batches()).label.tolist()
+        for draws, spec in specs.items()
+    }
+    assert good == {None: [1] * 8, 4: [0, 0, 0, 1, 1, 1, 0, 0], 5: [0, 0, 0, 1, 1, 1, 0, 0]}
+    with pytest.raises(InputError, match=r"run: arm.draws: differs between its parts"):
+        next(EvaluatedRun("run", (specs[4], specs[5]), stream).batches())
 
 
 def test_scenes_and_robots_are_numbered_through_all_places() -> None:
