@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
+import shutil
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from importlib import import_module
@@ -16,7 +18,7 @@ from cyclopts import Parameter, Token
 
 from datagen.console.command_lines import options_of, prints
 from datagen.console.options import AsJson, File, refuse_output
-from datagen.console.printing import compiling_shown, print_json, print_rows
+from datagen.console.printing import compiling_shown, print_json, print_lines, print_rows
 from datagen.released import DEMO_BASE_HEIGHT_M, DEMO_REACH_M, MAP, sample_frame
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import whole_file
@@ -50,6 +52,7 @@ def print_prediction(
     out: str | Path | None = None,
     html: str | Path | None = None,
     demo: bool = False,
+    export: str | Path | None = None,
     goal: str | Path | None = None,
     robot: str | None = None,
     **_: Any,
@@ -66,13 +69,13 @@ def print_prediction(
         written = [(name, str(file)) for name, file in files if file is not None]
         if goal is not None and prediction.best is None:
             written[-1] = ("goal", f"none: {goal} is not written")
-        if demo:
-            shown = f"--frame {sample_frame()} --map {sample_frame() / MAP}"
-            own = prediction.robot
-            sizes = f"--base-height {own.base_height_m:g} --reach {own.arm_reach_m:g}"
-            named = "" if robot is None else f" --robot {robot}"
-            written.append(("again", f"datagen predict {shown} {sizes}{named} --out answer.png"))
         print_rows(f"base poses by {prediction.scorer}", [*report_rows(prediction), *written])
+        if demo:
+            place, own = sample_frame() if export is None else Path(export), prediction.robot
+            words = ["datagen", "predict", "--frame", str(place), "--map", str(place / MAP)]
+            words += ["--base-height", f"{own.base_height_m:g}", "--reach", f"{own.arm_reach_m:g}"]
+            words += ["--out", "answer.png", *([] if robot is None else ["--robot", robot])]
+            print_lines(f"again: {shlex.join(words)}")  # a table would break the line
     return 0 if prediction.best is not None else 1
 
 
@@ -123,6 +126,7 @@ class PredictOptions:
         base_height: Height of the arm's mount above the floor (m).
         reach: Reach of the arm from its mount (m).
         demo: Predict on the frame that ships with the package; writes demo.png and demo.html.
+        export: With --demo, new folder for a copy of that frame.
         frame: Frame as a folder, .npz, .ply or .pcd; several with poses are fused.
         bag: Recording of ROS 2 in place of frames: .mcap, .db3 or a folder of rosbag2, with tf.
         at: Seconds from the start of the recording to its frame; several frames are fused.
@@ -152,6 +156,7 @@ class PredictOptions:
     base_height: float | None = None
     reach: float | None = None
     demo: bool = False
+    export: File | None = None
     frame: Frames | None = None
     bag: File | None = None
     at: Annotated[Sequence[float], _UNSET] = ()
@@ -182,6 +187,9 @@ class PredictOptions:
         if self.demo and not (self.frame is self.click is self.box is self.bag is None):
             fix = "Omit --demo to predict on a frame of your own"
             raise InputError("--demo", "", "has a frame and a click of its own", fix)
+        if self.export is not None and (not self.demo or Path(self.export).exists()):
+            problem = "exists already" if self.demo else "is given without --demo"
+            raise InputError("--export", str(self.export), problem, "Name a new folder, with --demo")
         if self.bag is not None and self.frame is not None:
             raise InputError("--bag", "", "is given with --frame", "Give one of them")
         if self.bag is None and (self.at or self.topic):
@@ -242,12 +250,13 @@ def predict(given: PredictOptions) -> Prediction:
     )
     from datagen.train.prediction import predict as scored
 
-    name = given.robot or ""
+    name, copied = given.robot or "", given.export
     given, yaw_rad = (given, 0.0) if given.robot is None else _of_robot(given, given.robot)
     if given.demo:
         given = replace(
             given,
             demo=False,
+            export=None,
             frame=[sample_frame()],
             map=given.map or [sample_frame() / MAP],
             base_height=DEMO_BASE_HEIGHT_M if given.base_height is None else given.base_height,
@@ -261,7 +270,7 @@ def predict(given: PredictOptions) -> Prediction:
     direction = None if given.gravity is None else _direction(given.gravity)
     out, html, goal = (None if file is None else Path(file) for file in (given.out, given.html, given.goal))
     named, recorded, known = given.frame or (), None, given.map
-    _refuse_outputs(out, html, goal, [*named, given.bag, *given.map, *given.keep_out])
+    _refuse_outputs(out, html, goal, [*named, given.bag, *given.map, *given.keep_out, copied])
     if given.bag is not None:
         from datagen.train.prediction.recordings import read_recording
 
@@ -305,6 +314,8 @@ def predict(given: PredictOptions) -> Prediction:
         from datagen.train.prediction.goals import write_goal
 
         write_goal(goal, answer, *(("map", 0) if recorded is None else (recorded.world, recorded.stamp_ns)))
+    if copied is not None:
+        shutil.copytree(sample_frame(), copied, copy_function=shutil.copyfile)  # writable
     return answer
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import IO, Any
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
 
 from datagen.display.styles import TARGET
 
@@ -29,16 +27,9 @@ def new_sheet(title: str, height_in: float) -> Figure:
 
 
 def save_sheet(figure: Figure, out: Path | IO[bytes], ending: str = ".png") -> None:
-    """Write the figure as a true-colour PNG, as small as it gets without loss, or as .pdf or .svg."""
-    if ending != ".png":
-        figure.savefig(
-            out, format=ending[1:], metadata={"Date" if ending == ".svg" else "CreationDate": None}
-        )
-        return
-    with io.BytesIO() as drawn:
-        figure.savefig(drawn, format="raw")
-        sheet = Image.frombuffer("RGBA", figure.canvas.get_width_height(), drawn.getvalue())
-        sheet.convert("RGB").save(out, format="png", optimize=True)
+    """Write the figure as .png, .pdf or .svg, without its date and version."""
+    metadata = {".png": "Software", ".pdf": "CreationDate", ".svg": "Date"}
+    figure.savefig(out, format=ending[1:], metadata={metadata[ending]: None})
 
 
 def draw_frame(axes: Axes, rgb: Any, target: Any, title: str = "RGB frame, target outlined") -> None:

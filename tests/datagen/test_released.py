@@ -83,7 +83,7 @@ def test_the_demonstration_answers_what_the_card_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert cli.run(["predict", "--demo"]) == 0
+    assert cli.run(["predict", "--demo", "--export", "my frame"]) == 0
     out = capsys.readouterr().out
     assert "base poses by the released model" in out and "demo.png" in out and "demo.html" in out
     assert Image.open(tmp_path / "demo.png").size[0] > 500
@@ -92,6 +92,10 @@ def test_the_demonstration_answers_what_the_card_says(
     answer = json_of(capsys, ["predict", "--demo"])["best"]
     assert np.allclose([answer["x_m"], answer["y_m"]], said["base_xy_m"], atol=1e-3)
     assert math.isclose(answer["score"], said["score"], abs_tol=1e-3)
+    again = shlex.split(out.split("again: ")[1])[1:]
+    assert again[:5] == ["predict", "--frame", "my frame", "--map", "my frame/map.yaml"]
+    assert json_of(capsys, again)["best"] == answer and (tmp_path / "answer.png").is_file()
+    refused(["predict", "--demo", "--export", "my frame"], capsys)
 
 
 @needs_sim
@@ -105,8 +109,7 @@ def test_the_demonstration_is_also_of_other_robots(
     sizes = [answer["robot"][name] for name in ("arm_reach_m", "base_height_m")]
     assert sizes == pytest.approx([limits.reach_m[0], limits.base_height_m[0]])
     cli.run(["predict", "--demo", "--robot", "fetch"])
-    again = " ".join(capsys.readouterr().out.split("again")[1].split())
-    words = shlex.split(again)[1:]
+    words = shlex.split(capsys.readouterr().out.split("again: ")[1])[1:]
     assert json_of(capsys, words)["candidates"] == answer["candidates"]
 
 
@@ -133,6 +136,8 @@ def test_it_has_its_own_name_beside_other_models(tmp_path: Path) -> None:
         (["--demo", "--frame", "x"], "has a frame and a click of its own"),
         (["--frame", "x"], "--base-height: is missing"),
         (["--frame", "x", "--base-height", "0.7"], "--reach: is missing"),
+        (["--frame", "x", "--export", "y"], "is given without --demo"),
+        (["--demo", "--export", "a.png", "--out", "a.png"], "Give another name"),
         (["--demo", "--out", "none/a.png"], "its folder does not exist"),
     ],
 )

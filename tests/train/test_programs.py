@@ -35,7 +35,10 @@ answer = datagen.predict(
 )
 print(answer.best, answer.score[answer.best])
 """
-HEAVY = ("torch", "numba", "ray", "trimesh", "embreex", "sapien", "coal", "matplotlib", "plotly", "pandas")
+HEAVY = (
+    "torch", "numba", "ray", "trimesh", "embreex", "sapien", "coal", "matplotlib", "plotly", "pandas",
+    "zarr", "numcodecs", "obstore", "fastapi", "pyarrow", "cv2", "fontTools",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("scenes", [8, pytest.param(1000, marks=pytest.mark.slow)])

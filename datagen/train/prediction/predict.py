@@ -81,7 +81,6 @@ def predict(
     arrival: Arrival | None = None,
     known: KnownFloor | None = None,
     grid: int = 25,
-    half_width_m: float = 1.0,
     seed: int = 0,
 ) -> Prediction:
     """Score a square grid of base poses around the target that the frames show.
@@ -114,7 +113,8 @@ def predict(
     centre = np.array(target.center_m)
     cloud = crop_cloud(seen, centre, CROP, np.random.default_rng(seed))
     yaw_rad = 0.0 if arrival is None else arrival.yaw_std_rad
-    cells = observe_cells(seen, centre, robot, _grid(grid, half_width_m), yaw_rad, known)
+    params = CandidateParams(per_scene="grid", grid_cells=grid)
+    cells = observe_cells(seen, centre, robot, params, yaw_rad, known)
     score = scored(scorer, _batch(cloud, target, robot, cells))
     allowed = (CLEAR, UNSEEN) if allow_unseen else (CLEAR,)
     choice = choose(score, cells, allowed, scorer.threshold, arrival)
@@ -196,16 +196,6 @@ def _fill(frames: Sequence[SensorFrame]) -> tuple[list[SensorFrame], Filled | No
 def _locate(seen: SeenPoints) -> TargetBox:
     target = seen.points_m[seen.on_target].astype(np.float64)
     return locate(target, seen.points_m[~seen.on_target], seen.eyes_m[0])
-
-
-def _grid(cells: int, half_width_m: float) -> CandidateParams:
-    if not 2 <= cells <= 200:
-        raise InputError("--grid", str(cells), "is not between 2 and 200", "Give 25, as in training")
-    if not 0.05 <= half_width_m <= 5.0:
-        raise InputError(
-            "--half-width", str(half_width_m), "is not between 0.05 and 5", "Give 1.0, as in training"
-        )
-    return CandidateParams(per_scene="grid", grid_cells=cells, grid_half_width_m=half_width_m)
 
 
 def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, cells: BaseCells) -> Batch[Array]:

@@ -7,11 +7,13 @@ scores without a compiler, and for registered robots without their URDFs.
 from __future__ import annotations
 
 from functools import lru_cache
+from hashlib import sha256
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from datagen.workers.content_cache import CacheFolder, version_of
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.kinematics.tree import KinematicTree, frame_poses
 from datagen.workers.motion.pose_reach import PoseReach, known_arm, pose_reach
@@ -23,6 +25,7 @@ _SAMPLES = 1 << 17
 _AT_ONCE = 1 << 13  # bounds memory
 _LEAST_RADIUS_M, _MOST_SPHERES = 0.015, 5  # of a link
 TREE, RADIUS = "tree.", "radius_m"  # fields of a registered robot
+_CACHE = CacheFolder("arm-links-1", most_files=32)  # 6 to 16 MB each; 1: version of `_sampled`
 
 
 class ArmLinks(NamedTuple):
@@ -38,8 +41,8 @@ class ArmLinks(NamedTuple):
     center_m: npt.NDArray[np.float16]  # (C, B, 3)
     radius_m: F64  # (B,)
     along: F64  # (B,), share of the joints between base and wrist that move the sphere
-    turn_limits_rad: tuple[float, float]
-    half_m: float  # of the map: scaled arms have another
+    turn_limits_rad: F64  # (2,)
+    half_m: F64  # (), of the map: scaled arms have another
 
 
 @lru_cache(maxsize=16)
@@ -52,7 +55,12 @@ def arm_links(name: str) -> ArmLinks:
         from datagen.workers.motion.measured_reach import link_spheres, reaches_of
 
         (tree, radius_m), reach_m = link_spheres(name), float(reaches_of(name)[-1])
-    return _sampled(tree, radius_m, pose_reach(name, reach_m))
+    arm = pose_reach(name, reach_m)
+    parts = b"-".join(np.asarray(part).tobytes() for part in (*tree, radius_m, *arm))
+    key = f"{sha256(parts).hexdigest()}-{version_of('numpy')}"
+    if (stored := _CACHE.load(key)) is None:
+        _CACHE.store(key, stored := _sampled(tree, radius_m, arm)._asdict())
+    return ArmLinks(**stored)
 
 
 def _sampled(tree: KinematicTree, radius_m: F64, arm: PoseReach) -> ArmLinks:
@@ -82,9 +90,9 @@ def _sampled(tree: KinematicTree, radius_m: F64, arm: PoseReach) -> ArmLinks:
     depth = np.zeros(len(tree.parent))
     depth[way[::-1]] = np.arange(1, 1 + len(way)) / len(way)
     upright = int(tree.coordinate[next((j for j in way[::-1] if not tree.slides[j]), way[0])])
-    limits_rad = (float(tree.lower[upright]), float(tree.upper[upright])) if arm.turns else (-np.inf, np.inf)
+    limits = np.array([tree.lower[upright], tree.upper[upright]] if arm.turns else [-np.inf, np.inf])
     turn_rad, along = q[:, upright] - azimuth, depth[tree.frame_joint[:-1]]
-    return ArmLinks(cell, wrist_m[chosen], turn_rad, centers, radius_m, along, limits_rad, arm.half_m)
+    return ArmLinks(cell, wrist_m[chosen], turn_rad, centers, radius_m, along, limits, np.array(arm.half_m))
 
 
 def cells_at(arm: PoseReach, distance_m: F64, height_m: F64, direction: Ints) -> Ints:

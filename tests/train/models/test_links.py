@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from datagen.train.hands.reach import N_ROOMS, obstacles, room_codes
 from datagen.train.inputs import F64, U8, Clouds
+from datagen.workers.motion import arm_links as module
 from datagen.workers.motion.arm_links import arm_links
 from datagen.workers.motion.pose_reach import pose_reach, reach_codes
 from tests.sim_extra import needs_robots, needs_sim
@@ -79,3 +82,11 @@ def test_rooms_turn_with_the_scene(angle: float) -> None:
     assert before[before > 0].std() > 20
     # Distances are those of cells of 2.5 cm.
     assert np.abs(after - before)[(before > 0) & (after > 0)].mean() < 12
+
+
+def test_links_are_sampled_once_on_a_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path))
+    sampled = arm_links.__wrapped__("fetch")
+    monkeypatch.setattr(module, "_SAMPLES", 0)
+    for field, stored, fresh in zip(sampled._fields, arm_links.__wrapped__("fetch"), sampled, strict=True):
+        np.testing.assert_array_equal(stored, fresh, err_msg=field, strict=True)
