@@ -77,7 +77,7 @@ def struct(fields: type[_Tuple]) -> type[_Tuple]:
 
 
 def _read_uncounted(kind: Any, field: str) -> None:
-    """Read an array in a structure without counting the reference, which took a fifth of the planner's time."""
+    """Read arrays of a structure without counting references, which took a fifth of the time of a plan."""
 
     @imputils.lower_getattr(kind, field)
     def read(context: Any, builder: Any, typ: Any, value: Any) -> Any:
