@@ -73,7 +73,8 @@ def run_shard(
             scene, candidates, labelled, draws = _labelled_scene(world, index, source, clock)
             redraws.update(scene.redraws)
             drawn = {"decisive_draws": draws, "good_share": good_share(candidates, labelled)}
-            record = scene_row(scene, spec) | drawn
+            with clock.stage("observe"):
+                record = scene_row(scene, spec) | drawn
         else:
             scene = _stored_scene(world, index, rows, clock)
             candidates, record = reconstruct_candidates(rows.samples, scene), rows.record
@@ -113,21 +114,22 @@ def _labelled_scene(
 
     The last is 0 where the specification takes the first scene. Trials are not run to decide.
     """
-    spec = world.spec
+    spec, scene, draws = world.spec, None, 0
     if not draw_place(spec.scene, generator(spec.seed, Stream.PLACE, index))[1]:
         scene, candidates = generate_scene(world, index, clock)
-        return scene, candidates, source.label(scene, candidates, spec, clock), 0
+        return scene, candidates, source.label(scene, candidates, spec, clock), draws
+    # Needs the compiler, which labels without an arm do not.
+    from datagen.workers.labels.arm_sources import label_within
+
     assert spec.arm is not None
     plain = spec.arm.model_copy(update={"trial": None, "disturbance": None, "draws": None})
-    plan, plan_spec = load_label_source("plan"), spec.model_copy(update={"arm": plain})
-
-    def drawn(after: Scene | None) -> tuple[Scene, SceneCandidates, Columns]:
-        scene, candidates = generate_scene(world, index, clock, after)
-        return scene, candidates, plan.label(scene, candidates, plan_spec, clock)
-
-    (low, high), draws, (scene, candidates, labelled) = DECISIVE_SHARES, 1, drawn(None)
-    while draws < MOST_DECISIVE_DRAWS and not low <= good_share(candidates, labelled) <= high:
-        draws, (scene, candidates, labelled) = draws + 1, drawn(scene)
+    plan_spec = spec.model_copy(update={"arm": plain})
+    while True:
+        draws, (scene, candidates) = draws + 1, generate_scene(world, index, clock, scene)
+        shares = DECISIVE_SHARES if draws < MOST_DECISIVE_DRAWS else (0.0, 1.0)
+        labelled = label_within(scene, candidates, plan_spec, clock, shares)
+        if labelled is not None:
+            break
     if source.name != "plan" or plan_spec != spec:
         labelled = source.label(scene, candidates, spec, clock)
     return scene, candidates, labelled, draws
@@ -190,10 +192,11 @@ def _seen_again(scene: ReconstructedScene, spec: Specification, rows: SceneRows,
     """The stored record as seen from another viewpoint, or as it is where no other sees the target."""
     item = (scene.index, scene.retry, view)
     try:
-        seen = observe(scene.house, str(rows.record["room_id"]), scene.geometry, scene.rays, spec, item)
+        room_id = str(rows.record["room_id"])
+        camera, share, draw_cloud = observe(scene.house, room_id, scene.geometry, scene.rays, spec, item)
     except SceneRejected:
         return dict(rows.record)
-    return {**rows.record, **_seen_row(*seen)}
+    return {**rows.record, **_seen_row(camera, share, draw_cloud())}
 
 
 def candidate_columns(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -52,6 +52,11 @@ class HouseRecord:
     things: list[Thing]
     findings: Counter[str]
 
+    @cached_property
+    def wall_bodies(self) -> list[StaticBody]:
+        """The walls around their holes, which open doors of furniture leave as they are."""
+        return wall_bodies(list(self.walls.values()), self.holes)
+
 
 def read_house(root: JsonNode, assets: Mapping[str, Asset]) -> HouseRecord:
     """The document without meshes: a tenth of the work. Raises InputError that names the JSON path.
@@ -92,7 +97,7 @@ def _assemble(record: HouseRecord, house_id: str, digest: str, is_open: bool) ->
             surfaces.extend(top_surfaces(thing, owner))
         if is_open and owner and thing.is_upright:
             surfaces.extend(other_surfaces(thing, owner))
-    everything = (*record.floors, *wall_bodies(list(record.walls.values()), record.holes), *bodies)
+    everything = (*record.floors, *record.wall_bodies, *bodies)
     opener = None if is_open else partial(_assemble, record, house_id, digest, is_open=True)
     rooms = tuple(record.rooms)
     return House(house_id, digest, rooms, everything, tuple(surfaces), record.findings, opener)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
 import numpy as np
-from numba.core import types
+from numba.core import cgutils, imputils, types
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
@@ -65,6 +65,8 @@ def struct(fields: type[_Tuple]) -> type[_Tuple]:
     setattr(sys.modules[fields.__module__], kind.__name__, kind)
     made = type(name, (structref.StructRefProxy,), own)
     structref.define_proxy(made, kind, list(fields._fields))
+    for field in fields._fields:
+        _read_uncounted(kind, field)
 
     def new(*values: Any) -> Any:
         return made(*values)
@@ -72,6 +74,22 @@ def struct(fields: type[_Tuple]) -> type[_Tuple]:
     new.__module__, new.__qualname__ = fields.__module__, f"{name}.new"
     _new_structs[fields] = compiled(new)
     return cast("type[_Tuple]", made)
+
+
+def _read_uncounted(kind: Any, field: str) -> None:
+    """Read arrays of a structure without counting references, which took a fifth of the time of a plan."""
+
+    @imputils.lower_getattr(kind, field)
+    def read(context: Any, builder: Any, typ: Any, value: Any) -> Any:
+        found = getattr(structref._Utils(context, builder, typ).get_data_struct(value), field)
+        if not isinstance(typ.field_dict[field], types.Array):
+            return imputils.impl_ret_borrowed(context, builder, typ.field_dict[field], found)
+        array = cgutils.create_struct_proxy(typ.field_dict[field])(context, builder, value=found)
+        array.meminfo = cgutils.get_null_value(array.meminfo.type)
+        array.parent = cgutils.get_null_value(array.parent.type)
+        return array._getvalue()
+
+    del read
 
 
 _new_structs: dict[type, Callable[..., Any]] = {}

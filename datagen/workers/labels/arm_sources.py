@@ -3,6 +3,7 @@ plan, executed in physics, lifts and holds the target (`sim`)."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -44,6 +45,64 @@ def label_with_trials(
     scene: SettledScene, candidates: SceneCandidates, spec: Specification, clock: StageClock
 ) -> tuple[Columns, list[CandidateTrial]]:
     """The columns of `plan`, and the trial behind each row."""
+    tried = list(_trials(scene, candidates, spec, clock))
+    return _columns(scene, candidates, spec, clock, tried), [trial for _, trial in tried]
+
+
+def label_within(
+    scene: SettledScene,
+    candidates: SceneCandidates,
+    spec: Specification,
+    clock: StageClock,
+    shares: tuple[float, float],
+) -> Columns | None:
+    """The columns of `plan` where the share of good ones among the candidates that are clear and in reach is
+    within `shares`. None as soon as it is known not to be."""
+    low, high = shares
+    tried, good, among = list[_Tried](), 0, int((candidates.clearance_m >= 0).sum())
+    for at, trial in _trials(scene, candidates, spec, clock):
+        tried.append((at, trial))
+        good += trial.outcome == "success"
+        among -= trial.outcome == "out_of_reach"
+        if good > 0 and good / among > high:
+            return None
+    if (good / among if among else 0.0) < low:
+        return None
+    return _columns(scene, candidates, spec, clock, tried)
+
+
+_Tried = tuple[ArmInScene, CandidateTrial]  # by the first draw of its robot
+
+
+def _trials(
+    scene: SettledScene, candidates: SceneCandidates, spec: Specification, clock: StageClock
+) -> Iterator[_Tried]:
+    arms: dict[tuple[float, float, int], ArmInScene] = {}
+    draws = arm_of(spec).draws or 1
+    for row in range(len(candidates)):
+        by_draw = list[CandidateTrial]()
+        reach_m, height_m = float(candidates.arm_reach_m[row]), float(candidates.base_height_m[row])
+        for draw in range(draws):
+            key = (reach_m, height_m, draw)
+            if key not in arms:
+                arms[key] = arm_in_scene(scene, candidates, row, spec, clock, draw)
+            by_draw.append(try_candidate(arms[key], candidates, row, spec))
+        trial = by_draw[0]
+        if draws > 1:
+            plans, tries = sum(t.successes for t in by_draw), sum(t.trials for t in by_draw)
+            trial = replace(trial, successes=plans, trials=tries)
+        count_label(clock)
+        yield arms[reach_m, height_m, 0], trial
+
+
+def _columns(
+    scene: SettledScene,
+    candidates: SceneCandidates,
+    spec: Specification,
+    clock: StageClock,
+    tried: Sequence[_Tried],
+) -> Columns:
+    """The columns of the heuristic and of planning."""
     columns = heuristic_source.label(scene, candidates, spec, clock)
     columns["heuristic_label"] = columns["label"]
     n = len(candidates)
@@ -59,28 +118,12 @@ def label_with_trials(
         "trials": np.zeros(n, np.int16),
         "successes": np.zeros(n, np.int16),
     }
-    arms: dict[tuple[float, float, int], ArmInScene] = {}
-    draws, trials = arm_of(spec).draws or 1, list[CandidateTrial]()
-    for row in range(n):
-        by_draw = list[CandidateTrial]()
-        reach_m, height_m = float(candidates.arm_reach_m[row]), float(candidates.base_height_m[row])
-        for draw in range(draws):
-            key = (reach_m, height_m, draw)
-            if key not in arms:
-                arms[key] = arm_in_scene(scene, candidates, row, spec, clock, draw)
-            by_draw.append(try_candidate(arms[key], candidates, row, spec))
-        trial = by_draw[0]
-        if draws > 1:
-            plans, tries = sum(t.successes for t in by_draw), sum(t.trials for t in by_draw)
-            trial = replace(trial, successes=plans, trials=tries)
-        trials.append(trial)
+    for row, (at, trial) in enumerate(tried):
         _write(columns, row, trial)
         if trial.plan is not None:
-            at = arms[reach_m, height_m, 0]
             _write_plan(columns, row, at, at.base_pose(candidates, row), trial.plan)
-        count_label(clock)
     columns["label"] = (columns["outcome"] == _CODES["success"]).astype(np.uint8)
-    return columns, trials
+    return columns
 
 
 def _write(columns: Columns, k: int, trial: CandidateTrial) -> None:

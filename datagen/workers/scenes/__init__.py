@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, TypeAlias
 
 from datagen.schemas.specification import Specification
@@ -40,7 +42,7 @@ SettledScene: TypeAlias = "Scene | ReconstructedScene"
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A settled and observed scene. Object 0 is the target."""
+    """A settled scene with the camera that observes it. Object 0 is the target."""
 
     index: int
     retry: int
@@ -52,7 +54,13 @@ class Scene:
     rays: RayScene
     camera: Camera
     target_visible_fraction: float
-    cloud: Cloud
+    draw_cloud: Callable[[], Cloud]  # to be called once
+
+    @cached_property
+    def cloud(self) -> Cloud:
+        """What the camera sees, computed on first use: most scenes that are labelled to find a decisive one
+        are not kept."""
+        return self.draw_cloud()
 
     @property
     def T_world_object(self) -> F64:

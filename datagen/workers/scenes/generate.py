@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -151,8 +152,8 @@ def observe(
     rays: RayScene,
     spec: Specification,
     item: tuple[int, ...],
-) -> tuple[Camera, float, Cloud]:
-    """A camera in the room, the share of the target that it sees, and the scene's cloud from there.
+) -> tuple[Camera, float, Callable[[], Cloud]]:
+    """A camera in the room, the share of the target that it sees, and a function that draws its cloud.
 
     `item` is the scene's index and retry, and the number of the viewpoint where it is not the first. Raises
     SceneRejected("no_viewpoint") as `draw_viewpoint`.
@@ -160,11 +161,15 @@ def observe(
     params, rng = spec.observation, generator(spec.seed, Stream.OBSERVE, *item)
     room, target_m = house.house.room(room_id), geometry.T_world_object[0, :3, 3]
     camera, share = draw_viewpoint(rays, room, house.obstacles, target_m, params, spec.candidates, rng)
-    cast: PixelCaster = partial(cast_pixels, rays, camera)  # only the pixels that the cloud samples
-    if params.noise.enabled:  # it needs neighbouring pixels
-        noise_rng = generator(spec.seed, Stream.NOISE, *item)
-        cast = caster_of(render_frame(params, geometry, camera, noise_rng))
-    return camera, share, observe_cloud(cast, camera, 1, target_m, float(rays.radii_m[0]), params, rng)
+
+    def draw_cloud() -> Cloud:
+        cast: PixelCaster = partial(cast_pixels, rays, camera)  # only the pixels that the cloud samples
+        if params.noise.enabled:  # it needs neighbouring pixels
+            noise_rng = generator(spec.seed, Stream.NOISE, *item)
+            cast = caster_of(render_frame(params, geometry, camera, noise_rng))
+        return observe_cloud(cast, camera, 1, target_m, float(rays.radii_m[0]), params, rng)
+
+    return camera, share, draw_cloud
 
 
 def _reach_of(spec: Specification) -> ReachableSet | None:

@@ -2,13 +2,56 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
 
 import datagen
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.kinematics.compiler import compiled, in_memory, struct
+
+
+class Inner(NamedTuple):
+    values: F64  # (N,)
+
+
+class Outer(NamedTuple):
+    inner: Inner
+    values: F64  # (N,)
+
+
+new_inner = struct(Inner)
+struct(Outer)
+
+
+@compiled
+def total(outer: Outer) -> float:
+    return outer.values.sum() + outer.inner.values.sum()
+
+
+@compiled
+def made_inside(n: int) -> float:
+    made = new_inner(np.full(n, 2.0))
+    values = made.values
+    values[0] += 1.0
+    return made.values.sum()
+
+
+def test_structures_keep_their_arrays_though_reading_them_counts_no_reference() -> None:
+    n, outers = 100_000, []
+    for k in range(20):
+        outers.append(in_memory(Outer(Inner(np.full(n, float(k))), np.full(n, 1.0))))
+        gc.collect()
+    for k, outer in enumerate(outers):
+        assert total(outer) == total(outer) == n * (k + 1)
+    assert made_inside(n) == 2 * n + 1
+
 
 ASK = """
 import numpy as np

@@ -30,6 +30,7 @@ from datagen.workers.labels import arm_labelling, arm_sources, load_label_source
 from datagen.workers.labels.arm_labelling import arm_in_scene, draw_disturbances, try_candidate
 from datagen.workers.labels.arrival_trial import try_arrival
 from datagen.workers.motion import MotionPlan
+from datagen.workers.run_shard import good_share
 from datagen.workers.scenes import SettledScene
 from datagen.workers.trials import TrialResult
 from datagen.workers.trials.execute import run_trial
@@ -161,6 +162,22 @@ def test_the_first_grasp_decides_and_later_ones_are_stored(monkeypatch: pytest.M
     retries = [RETRY_OUTCOMES[code] for code in columns["retry_outcome"]]
     assert retries == [trial.retry_outcome or "none" for trial in trials]
     assert "none" not in retries[:3] and set(retries[3:]) == {"none"}
+
+
+@pytest.mark.parametrize(
+    ("shares", "tried"), [((0.0, 1.0), 6), ((0.6, 0.8), 6), ((0.05, 0.6), 3), ((0.8, 1.0), 6)]
+)
+def test_labelling_ends_where_the_share_of_good_candidates_is_outside(
+    labelled: dict[str, Any], shares: tuple[float, float], tried: int
+) -> None:
+    """Three of the four candidates that are clear and in reach are good, the first three in order."""
+    at, clock = scene(), WatchedClock()
+    columns = arm_sources.label_within(at, candidates(at), specification(), clock, shares)
+    assert clock.labels == tried
+    share = good_share(candidates(at), labelled["plan"])
+    assert (columns is not None) == (shares[0] <= share <= shares[1])
+    for name, column in (columns or {}).items():
+        np.testing.assert_array_equal(column, labelled["plan"][name])
 
 
 def test_draws_are_counted_and_the_first_is_stored(labelled: dict[str, Any]) -> None:

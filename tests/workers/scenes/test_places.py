@@ -22,6 +22,7 @@ from datagen.schemas.specification import (
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
 from datagen.workers.run_shard import MOST_DECISIVE_DRAWS, run_shard
+from datagen.workers.scenes import generate
 from datagen.workers.scenes.reconstruct import reconstruct_scene
 from datagen.workers.world import World, assemble_world
 
@@ -87,7 +88,11 @@ def test_houses_seen_to_lack_a_place_are_not_loaded_for_it_again(monkeypatch: py
         np.testing.assert_array_equal(again.scene[name], column, err_msg=name)
 
 
-def test_decisive_scenes_are_drawn_until_their_share_is_between_the_limits() -> None:
+def test_decisive_scenes_are_drawn_until_their_share_is_between_the_limits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    observed, draw = list[float](), generate.observe_cloud
+    monkeypatch.setattr(generate, "observe_cloud", lambda *args: observed.append(1.0) or draw(*args))
     world = world_of(
         SceneParams(places=Places(seat=1.0), decisive=1.0, n_clutter=3),
         label_source="plan",
@@ -102,13 +107,14 @@ def test_decisive_scenes_are_drawn_until_their_share_is_between_the_limits() -> 
         "013_apple",
         "077_rubiks_cube",
     ]  # the grasps of each take seconds
-    made = run_shard(world.spec, world, [0, 1])
+    made = run_shard(world.spec, world, [0, 5])
     shares, draws = made.scene["good_share"], made.scene["decisive_draws"]
-    for scene in (0, 1):
+    assert len(observed) == 2 < draws.sum()  # scenes that are not kept are not observed
+    for row, scene in enumerate((0, 5)):
         labels = _samples(made.sample, scene)["label"]
-        assert 1 <= draws[scene] <= MOST_DECISIVE_DRAWS
-        within = DECISIVE_SHARES[0] <= shares[scene] <= DECISIVE_SHARES[1]
-        assert within or draws[scene] == MOST_DECISIVE_DRAWS
-        assert 0 < labels.mean() <= shares[scene] + 1e-6
+        assert 1 <= draws[row] <= MOST_DECISIVE_DRAWS
+        within = DECISIVE_SHARES[0] <= shares[row] <= DECISIVE_SHARES[1]
+        assert within or draws[row] == MOST_DECISIVE_DRAWS
+        assert 0 < labels.mean() <= shares[row] + 1e-6
     free = world_of(world.spec.scene.model_copy(update={"decisive": 0.0}))
     assert (run_shard(free.spec, free, [0]).scene["decisive_draws"] == 0).all()
