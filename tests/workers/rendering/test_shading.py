@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from datagen.workers.houses import open_houses
 from datagen.workers.houses.glb import read_glb
@@ -114,18 +117,17 @@ def test_patterns_follow_the_name_and_the_house_and_far_joints_fade() -> None:
 
 def test_base_colours_and_textures_of_meshes_appear_in_the_frame(tmp_path: Path) -> None:
     """A face has one colour: that of its texture's middle, or its material's factor."""
-    boxes = []
+    boxes: list[Any] = []
     for x, rgb, is_image in ((1.75, (200, 40, 30), True), (2.25, (30, 60, 200), False)):
-        box = trimesh.creation.box(extents=(0.2, 0.2, 0.2))
+        box: Any = trimesh.creation.box(extents=(0.2, 0.2, 0.2))
         box.apply_translation((x, 0.85, -1.5))
         image = Image.new("RGB", (8, 8), rgb) if is_image else None
-        material = trimesh.visual.material.PBRMaterial(
-            baseColorTexture=image, baseColorFactor=None if is_image else [*rgb, 255]
-        )
+        material = PBRMaterial(baseColorTexture=image, baseColorFactor=None if is_image else [*rgb, 255])
         uv = np.full((len(box.vertices), 2), 0.5)
-        box.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+        box.visual = TextureVisuals(uv=uv, material=material)
         boxes.append(box)
-    (tmp_path / "a.glb").write_bytes(trimesh.Scene(boxes).export(file_type="glb"))
+    data: Any = trimesh.Scene(boxes).export(file_type="glb")
+    (tmp_path / "a.glb").write_bytes(data)
     turn = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     mesh = read_glb(tmp_path / "a.glb").transformed(turn)
     body = replace(box_body("boxes", "small", "Box", (0.1, 0.1, 0.1), (0, 0, 0)), visual=mesh)
