@@ -29,10 +29,10 @@ def main() -> None:
     source, sums = open_source(options.run, options.scenes, AS_FOUND), np.zeros(2)
     for run, rows in source.scenes(source.first, source.past):
         scene = source.rebuilt(run, rows.record)
-        rays, rooms, camera = scene.rays, scene.house.house.rooms, scene.camera
+        rays, house, camera = scene.rays, scene.house.house, scene.camera
         light = draw_light(camera, np.random.default_rng(scene.index))
         sums[0] += _least_s(partial(render_rays, rays, camera))
-        sums[1] += _least_s(partial(render_shaded, rays, rooms, camera, light))
+        sums[1] += _least_s(partial(render_shaded, rays, house, camera, light))
     n = source.past - source.first
     print(f"{n} frames: {1000 * sums[0] / n:.0f} ms plain, {1000 * sums[1] / n:.0f} ms shaded,", end=" ")
     print(f"ratio {sums[1] / sums[0]:.2f}")

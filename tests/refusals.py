@@ -30,6 +30,6 @@ PHASES = {
 
 
 def without_phases(told: str) -> list[str]:
-    """The lines on standard error, but for those that name a phase as it begins or the built-in houses."""
+    """The lines on standard error, but for those of phases, the built-in houses and costs."""
     lines = [line for line in told.splitlines() if line not in PHASES]
-    return [line for line in lines if not line.startswith("Using built-in houses.")]
+    return [line for line in lines if not line.startswith(("Using built-in houses.", "frames: about"))]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import KW_ONLY, dataclass
 from typing import Annotated, Any
 
 from datagen.console.command_lines import options_of, prints
 from datagen.console.options import RUN, AsJson, AssetSources, PathOrAddress
-from datagen.console.printing import counted, print_json, print_rows, size
+from datagen.console.printing import counted, print_json, print_rows, seconds, size
 from datagen.display.progress import counting
 from datagen.exports.export_run import export_run, open_source
+
+_FRAME_BYTES, _FRAME_S = 0.42, 1.3e-6  # of a pixel: docs/guides/export.md says how this was measured
 
 
 def print_export(report: dict[str, Any], json: bool, **_: Any) -> int:
@@ -64,6 +67,11 @@ def export(given: ExportOptions) -> dict[str, Any]:
         (1, 2)
     """
     source = open_source(str(given.run), given.scenes, given)
+    if given.to == "frames" and not given.json:
+        image = source.runs[0].manifest.spec.observation
+        pixels = (source.past - source.first) * image.width_px * image.height_px
+        cost = f"{size(_FRAME_BYTES * pixels)}, {seconds(_FRAME_S * pixels)} of a core"
+        sys.stderr.write(f"frames: about {cost}; fewer --scenes cost less\n")
     with counting("steps", as_json=given.json) as seen:
         storage, record = export_run(source, given.to, given.out, seen)
     sizes = {"files": len(record.files), "bytes": sum(file.size for file in record.files)}

@@ -34,7 +34,7 @@ def _files(source: ExportSource, run: Run, rows: SceneRows) -> Iterator[NewFile]
     scene, spec = source.rebuilt(run, rows.record), run.manifest.spec
     place, camera = (scene.index, scene.retry), scene.camera
     light = draw_light(camera, generator(spec.seed, Stream.LIGHT, *place))
-    frame = render_shaded(scene.rays, scene.house.house.rooms, camera, light)
+    frame = render_shaded(scene.rays, scene.house.house, camera, light)
     if spec.observation.noise.enabled:  # the same as in the stored cloud
         frame = add_noise(frame, spec.observation.noise, generator(spec.seed, Stream.NOISE, *place))
     depth = np.rint(frame.depth_m / _STEP_M)

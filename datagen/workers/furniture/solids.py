@@ -205,14 +205,17 @@ def material_rgb(material: JsonNode | None, of_floor: bool) -> Rgb:
     """Colour of a wall or floor material `{name, color?: {r, g, b}}` (0 to 1 each), or of its name."""
     if material is None:
         return (176, 172, 164) if of_floor else (218, 214, 206)
-    if isinstance(material.value, str):  # older files name the material without an object around it
-        return named_rgb(material.text(), of_floor)
-    colour = material.find("color")
+    colour = None if isinstance(material.value, str) else material.find("color")
     if colour is not None:
         r, g, b = (round(255 * colour.get(c).number(0.0, 1.0)) for c in "rgb")
         return (r, g, b)
-    name = material.find("name")
-    return named_rgb("" if name is None else name.text(), of_floor)
+    return named_rgb(material_name(material), of_floor)
+
+
+def material_name(material: JsonNode | None) -> str:
+    """The name of a material; older files have it without an object around it."""
+    name = material if material is None or isinstance(material.value, str) else material.find("name")
+    return "" if name is None else name.text()
 
 
 def named_rgb(name: str, of_floor: bool) -> Rgb:

@@ -74,6 +74,8 @@ class House:
     findings: Mapping[str, int] = field(default_factory=dict)
     # Builds it with open doors and all kinds of places; None where the source knows only tops.
     open_doors: Callable[[], House] | None = None
+    # Names of the materials of floors and walls by their colours.
+    materials: Mapping[tuple[int, int, int], str] = field(default_factory=dict)
 
     @cached_property
     def parts_m(self) -> list[F32]:

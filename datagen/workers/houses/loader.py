@@ -16,7 +16,7 @@ import numpy as np
 
 from datagen.workers.furniture.asset_geometry import asset_geometry
 from datagen.workers.furniture.assets import Asset
-from datagen.workers.furniture.solids import join, material_rgb, placed
+from datagen.workers.furniture.solids import Rgb, join, material_name, material_rgb, placed
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.houses.house import House, Room, StaticBody, Surface
@@ -51,6 +51,7 @@ class HouseRecord:
     holes: list[Hole]
     things: list[Thing]
     findings: Counter[str]
+    materials: dict[Rgb, str]
 
     @cached_property
     def wall_bodies(self) -> list[StaticBody]:
@@ -77,7 +78,12 @@ def read_house(root: JsonNode, assets: Mapping[str, Asset]) -> HouseRecord:
         holes += _holes(root.find(name), walls, open_walls, name == "doors", findings)
     things = read_things(root, assets, findings)
     refuse_implausible(root, things, rooms, len(holes), findings)
-    return HouseRecord(rooms, floors, walls, holes, things, findings)
+    materials = {
+        material_rgb(material, of_floor): material_name(material)
+        for part, key, of_floor in (("walls", "material", False), ("rooms", "floorMaterial", True))
+        for material in (entry.find(key) for entry in root.get(part).items(MAX_WALLS))
+    }
+    return HouseRecord(rooms, floors, walls, holes, things, findings, materials)
 
 
 def build_house(root: JsonNode, house_id: str, digest: str, assets: Mapping[str, Asset]) -> House:
@@ -99,8 +105,8 @@ def _assemble(record: HouseRecord, house_id: str, digest: str, is_open: bool) ->
             surfaces.extend(other_surfaces(thing, owner))
     everything = (*record.floors, *record.wall_bodies, *bodies)
     opener = None if is_open else partial(_assemble, record, house_id, digest, is_open=True)
-    rooms = tuple(record.rooms)
-    return House(house_id, digest, rooms, everything, tuple(surfaces), record.findings, opener)
+    rooms, places = tuple(record.rooms), tuple(surfaces)
+    return House(house_id, digest, rooms, everything, places, record.findings, opener, record.materials)
 
 
 def room_ids_at(points_m: F64, rooms: list[Room]) -> list[str]:

@@ -35,6 +35,7 @@ class RayMesh:
     mesh: Mesh
     hierarchy: EmbreeScene
     normals: F32  # (F, 3), unit, mesh frame
+    offsets_m: F32  # (F,) of the faces' planes from the origin, along their normals
 
     @cached_property
     def around_m(self) -> F64:
@@ -69,8 +70,9 @@ def ray_mesh(mesh: Mesh) -> RayMesh:
         np.ascontiguousarray(mesh.vertices_m, np.float32),
         np.ascontiguousarray(mesh.faces, np.int32),
     )
-    normals = face_normals(mesh.vertices_m[mesh.faces])
-    rays = RayMesh(mesh, hierarchy, normals.astype(np.float32))
+    normals = face_normals(mesh.vertices_m[mesh.faces]).astype(np.float32)
+    offsets_m = np.einsum("ij,ij->i", normals, mesh.vertices_m[mesh.faces[:, 0]])
+    rays = RayMesh(mesh, hierarchy, normals, offsets_m)
     # Embree builds on the first query; doing it here keeps that cost out of the stages that time rays.
     nearest(rays, np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
     return rays
@@ -185,26 +187,26 @@ def cast_surfaces(
     depth_m = hits.parameter.copy()
     body = np.where(hits.face >= 0, 0, -1).astype(np.int16)
     values = np.tile(nothing, (n, 1))
-    shown = hits.face >= 0
-    values[shown] = surface(scene.house, _take(hits, shown), directions[shown], None)
+    shown = np.flatnonzero(hits.face >= 0)
+    values[shown] = surface(scene.house, _take(hits, shown), directions.take(shown, axis=0), None)
 
     eye_m = camera.T_world_camera[:3, 3]
     for k, rays in enumerate(scene.objects):
         T = scene.T_world_object[k]
         near = _towards_sphere(eye_m, directions, T[:3, 3], float(scene.radii_m[k]))
-        local_origins, local_directions = into_frame(T, origins[near], directions[near])
+        local_origins, local_directions = into_frame(T, origins[: len(near)], directions.take(near, axis=0))
         found = first_hits(rays, local_origins, local_directions)
-        closer = found.parameter < depth_m[near]
+        closer = np.flatnonzero(found.parameter < depth_m[near])
         rows = near[closer]
         depth_m[rows], body[rows] = found.parameter[closer], k + 1
         R = T[:3, :3].astype(np.float32)
-        values[rows] = surface(rays, _take(found, closer), local_directions[closer], R)
+        values[rows] = surface(rays, _take(found, closer), local_directions.take(closer, axis=0), R)
     depth_m[depth_m >= MISS] = 0.0
     return values, depth_m, body, directions
 
 
-def _take(hits: Hits, rows: npt.NDArray[np.bool_]) -> Hits:
-    return Hits(hits.parameter[rows], hits.face[rows], hits.barycentric[rows])
+def _take(hits: Hits, rows: npt.NDArray[np.int64]) -> Hits:
+    return Hits(hits.parameter[rows], hits.face[rows], hits.barycentric.take(rows, axis=0))
 
 
 def _towards_sphere(eye_m: F64, directions: F32, centre_m: F64, radius_m: float) -> npt.NDArray[np.int64]:
@@ -236,7 +238,7 @@ def surface_colour(rays: RayMesh, hits: Hits) -> U8:
     """Colours (N, 3) of hits without light: of the texture, or of the face."""
     texture = rays.mesh.texture
     if texture is None:
-        return rays.mesh.face_rgb[hits.face]
+        return rays.mesh.face_rgb.take(hits.face, axis=0)
     u, v = hits.barycentric[:, :1], hits.barycentric[:, 1:]
     corners = texture.uv[rays.mesh.faces[hits.face]]  # (N, 3, 2)
     uv = (1 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2]

@@ -1,4 +1,4 @@
-"""Frames to look at and to learn from: a light that casts shadows, ceilings, and the sky through windows.
+"""Frames to look at and to learn from: cast shadows, patterns and textures, ceilings, sky through windows.
 
 Geometry, and so depth and bodies, are those of `embree.py`; stored clouds keep the colours that it gives.
 """
@@ -11,23 +11,23 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from datagen.workers.geometry.mesh import F32, F64, U8
+from datagen.workers.geometry.mesh import F32, F64, I32
 from datagen.workers.geometry.planar import inside_polygon
-from datagen.workers.houses.house import Room
-from datagen.workers.rendering import I16, Camera, Frame
+from datagen.workers.houses.house import House, Room
+from datagen.workers.rendering import Camera, Frame
 from datagen.workers.rendering.cloud import target_pixels
+from datagen.workers.rendering.covers import house_cover
 from datagen.workers.rendering.embree import (
     Hits,
     RayMesh,
     RayScene,
-    Values,
     cast_surfaces,
     into_frame,
     occluded,
     surface_colour,
 )
 
-I64 = npt.NDArray[np.int64]
+I16, I64 = npt.NDArray[np.int16], npt.NDArray[np.int64]
 
 _CEILING, _GROUND = np.array([[236, 234, 229], [128, 133, 112]], np.float32)
 _HORIZON, _ZENITH = np.array([[222, 232, 241], [104, 158, 222]], np.float32)
@@ -35,7 +35,7 @@ _HORIZON, _ZENITH = np.array([[222, 232, 241], [104, 158, 222]], np.float32)
 _AMBIENT, _FILL, _LIGHT = 0.58, (0.04, 0.06, 0.10), 0.50
 _LIGHT_M = 2.2  # only things below this height cast shadows: walls are higher, and would darken whole rooms
 _OFF_SURFACE_M = 1e-3
-_IN_CACHE = 16_384  # pixels
+_IN_CACHE = 49_152  # pixels
 _MARGIN = 1.3  # of the sphere around all objects, which a picture shows larger off its middle
 # Range of the light's direction: degrees above the horizon, and to a side of straight behind the camera.
 _ELEVATION_DEG, _ASIDE_DEG = (45.0, 75.0), (20.0, 70.0)
@@ -49,84 +49,104 @@ def draw_light(camera: Camera, rng: np.random.Generator) -> F32:
     return np.array([*level, np.sin(up)], np.float32)
 
 
-def render_shaded(scene: RayScene, rooms: Sequence[Room], camera: Camera, to_light: F32) -> Frame:
-    """The whole frame of a scene under parallel light from the direction `to_light` (3,), world.
+def render_shaded(scene: RayScene, house: House, camera: Camera, to_light: F32) -> Frame:
+    """The whole frame of a scene in `house` under parallel light from the direction `to_light` (3,), world.
 
     Rooms have ceilings at the top of the walls, which only colour the picture: they have no depth and no
     body, as little as the sky, and cast no shadow.
     """
-    h, w = camera.height_px, camera.width_px
-    center_m, radius_m = _objects_sphere(scene)
-    near = np.zeros(h * w, np.bool_)
-    near[target_pixels(camera, center_m, _MARGIN * radius_m)] = True
-    rgb, depth_m = np.empty((h * w, 3), np.uint8), np.empty(h * w, np.float32)
-    body, bare = np.empty(h * w, np.int16), replace(scene, objects=())
-    for visible, pixels in (scene, np.flatnonzero(near)), (bare, np.flatnonzero(~near)):
-        for k in range(0, len(pixels), _IN_CACHE):
-            block = pixels[k : k + _IN_CACHE]
-            surfaces = cast_surfaces(visible, camera, block, _surface, np.zeros(6, np.float32))
-            rgb[block] = _lit(scene, rooms, camera, to_light, surfaces)
-            depth_m[block], body[block] = surfaces[1:3]
-    return Frame(camera, rgb.reshape(h, w, 3), depth_m.reshape(h, w), body.reshape(h, w))
+    return _Lighting(scene, house, camera, to_light).frame()
 
 
-def _lit(
-    scene: RayScene,
-    rooms: Sequence[Room],
-    camera: Camera,
-    to_light: F32,
-    surfaces: tuple[Values, F32, I16, F32],
-) -> U8:
-    values, depth_m, body, rays = surfaces
-    colour, normals = values[:, :3], values[:, 3:]
-    faces_light, fill = (normals @ np.column_stack([to_light, np.array(_FILL, np.float32)])).T
-    rows = np.flatnonzero(faces_light > 0)
-    eye_m = camera.T_world_camera[:3, 3].astype(np.float32)
-    points_m = eye_m + depth_m[rows, None] * rays[rows] + _OFF_SURFACE_M * normals[rows]
-    rows = rows[~_in_shadow(scene, np.asarray(points_m, np.float32), to_light)]
-    light = _AMBIENT + fill
-    light[rows] += _LIGHT * faces_light[rows]
-    rgb = np.minimum(colour * light[:, None], 255).astype(np.uint8)
-    empty = np.flatnonzero(body < 0)
-    rgb[empty] = _outside(eye_m, rays[empty], rooms, float(scene.house.mesh.vertices_m[:, 2].max()))
-    return rgb
+class _Lighting:
+    """A scene under light, with what is the same for all pixels."""
 
+    def __init__(self, scene: RayScene, house: House, camera: Camera, to_light: F32) -> None:
+        self.scene, self.rooms, self.camera, self.to_light = scene, house.rooms, camera, to_light
+        self.cover, self.ceiling_m = house_cover(house), float(scene.house.mesh.vertices_m[:, 2].max())
+        self.eye_m = camera.T_world_camera[:3, 3].astype(np.float32)
+        centers_m = scene.T_world_object[:, :3, 3]
+        gaps_m = np.linalg.norm(centers_m - centers_m[0], axis=1)
+        self.sphere = centers_m[0], float((gaps_m + scene.radii_m).max())  # around the target, of all objects
+        # A face has one light. Faces of the house come first, then those of each object, as bodies do.
+        bodies = [(scene.house, np.eye(4)), *zip(scene.objects, scene.T_world_object, strict=True)]
+        self.starts = np.cumsum([0, *(len(rays.normals) for rays, _ in bodies)])[:-1]
+        self.lights = np.concatenate([self._light_of_faces(*body) for body in bodies], axis=1)
+        side = np.array([to_light[1], -to_light[0], 0]) / np.hypot(*to_light[:2])
+        self.axes = np.stack([to_light, side, np.cross(to_light, side)]).astype(np.float32)
 
-def _surface(rays: RayMesh, hits: Hits, directions: F32, R_world_mesh: F32 | None) -> F32:
-    """Colours and unit normals of hits, (N, 6): normals in the world frame, towards the camera."""
-    normals = rays.normals[hits.face]
-    normals *= -np.sign(np.einsum("ij,ij->i", normals, directions))[:, None]
-    if R_world_mesh is not None:
-        normals = normals @ R_world_mesh.T
-    return np.hstack([surface_colour(rays, hits), normals], dtype=np.float32)
+    def frame(self) -> Frame:
+        h, w = self.camera.height_px, self.camera.width_px
+        near = np.zeros(h * w, np.bool_)
+        near[target_pixels(self.camera, self.sphere[0], _MARGIN * self.sphere[1])] = True
+        rgb, depth_m = np.empty(h * w, np.int32), np.empty(h * w, np.float32)
+        body, bare = np.empty(h * w, np.int16), replace(self.scene, objects=())
+        for visible, pixels in (self.scene, np.flatnonzero(near)), (bare, np.flatnonzero(~near)):
+            for k in range(0, len(pixels), _IN_CACHE):
+                block = pixels[k : k + _IN_CACHE]
+                seen = cast_surfaces(visible, self.camera, block, self._surface, np.zeros(2, np.int32))
+                rgb[block], (_, depth_m[block], body[block], _) = self._lit(*seen), seen
+        colours = np.ascontiguousarray(rgb.view(np.uint8).reshape(h, w, 4)[:, :, :3])
+        return Frame(self.camera, colours, depth_m.reshape(h, w), body.reshape(h, w))
 
+    def _light_of_faces(self, rays: RayMesh, T: F64) -> F32:
+        """Light (2, F) on a body's faces in shadow and without; the same where they do not face the lamp."""
+        vectors = np.stack([self.to_light, np.array(_FILL), self.eye_m - T[:3, 3]]) @ T[:3, :3]
+        light, fill, eye_m = (rays.normals @ vectors.T.astype(np.float32)).T
+        side = np.where(eye_m > rays.offsets_m, np.float32(1), np.float32(-1))  # that the camera sees
+        ambient = _AMBIENT + side * fill
+        return np.stack([ambient, ambient + _LIGHT * np.maximum(side * light, 0)])
 
-def _in_shadow(scene: RayScene, points_m: F32, to_light: F32) -> npt.NDArray[np.bool_]:
-    """Whether something lies between points (N, 3) and the light."""
-    towards = np.tile(to_light, (len(points_m), 1))
-    limits = np.maximum((_LIGHT_M - points_m[:, 2]) / to_light[2], 0)
-    dark = occluded(scene.house, points_m, towards, limits)
-    # Objects lie around the target: few points can be in the shadow of any.
-    center_m, radius_m = _objects_sphere(scene)
-    near = _below_sphere(points_m, to_light, center_m, radius_m)
-    for rays, T, radius_m in zip(scene.objects, scene.T_world_object, scene.radii_m, strict=True):
-        rows = near[_below_sphere(points_m[near], to_light, T[:3, 3], radius_m)]
-        dark[rows] |= occluded(rays, *into_frame(T, points_m[rows], towards[rows]), limits[rows])
-    return dark
+    def _surface(self, rays: RayMesh, hits: Hits, *_: F32 | None) -> I32:
+        """Face and packed colour of hits, (N, 2)."""
+        values = np.column_stack([hits.face, hits.face])
+        rgb = values.view(np.uint8)[:, 4:7]
+        rgb[:] = surface_colour(rays, hits)
+        return values
 
+    def _lit(self, values: I32, depth_m: F32, body: I16, rays: F32) -> I32:
+        """Packed colours (N,) of pixels, of which `values` are those of `_surface`."""
+        # Coordinates are rows: NumPy is several times as fast along long rows as along triples.
+        rays = np.ascontiguousarray(rays.T)
+        points_m = np.asarray(self.eye_m[:, None] + depth_m * rays, np.float32)
+        face, packed = values[:, 0] + self.starts.take(body), values[:, 1].copy()  # any face without a body
+        shadow, light = self.lights.take(face, axis=1)
+        rows = np.flatnonzero((light > shadow) & (points_m[2] < _LIGHT_M))
+        rows = rows[self._in_shadow(points_m.take(rows, axis=1))]
+        light[rows] = shadow[rows]
+        pattern = self.cover.pattern.take(face, mode="clip")
+        rows = np.flatnonzero((pattern > 0) & (body == 0))
+        normals = self.scene.house.normals.take(face[rows], axis=0).T
+        facing = np.abs(np.einsum("ij,ij->j", normals, rays.take(rows, axis=1)))
+        seen_m = depth_m[rows] / (np.float32(self.camera.fx_px) * np.maximum(facing, np.float32(1e-3)))
+        light[rows] *= self.cover.shares(pattern[rows], points_m.take(rows, axis=1), normals, seen_m)
+        rgb = packed.view(np.uint8).reshape(-1, 4)[:, :3]
+        for channel in rgb.T:
+            channel[:] = np.minimum(channel * light, 255)
+        empty = np.flatnonzero(body < 0)
+        rgb[empty] = _outside(self.eye_m, rays[:, empty].T, self.rooms, self.ceiling_m)
+        return packed
 
-def _objects_sphere(scene: RayScene) -> tuple[F64, float]:
-    """Centre (3,), the target's, and radius (m) of a sphere that holds all objects, world."""
-    centers_m = scene.T_world_object[:, :3, 3]
-    return centers_m[0], float((np.linalg.norm(centers_m - centers_m[0], axis=1) + scene.radii_m).max())
+    def _in_shadow(self, points_m: F32) -> npt.NDArray[np.bool_]:
+        """Whether something lies between points (3, N) and the light."""
+        starts_m = np.asarray(points_m.T + _OFF_SURFACE_M * self.to_light, np.float32, order="C")
+        towards = np.tile(self.to_light, (len(starts_m), 1))
+        limits = (_LIGHT_M - points_m[2]) / self.to_light[2]
+        dark = occluded(self.scene.house, starts_m, towards, limits)
+        # Objects lie around the target: few points can be in the shadow of any.
+        across = self.axes @ points_m
+        near = self._below(across, *self.sphere)
+        across, scene = across.take(near, axis=1), self.scene
+        for rays, T, radius_m in zip(scene.objects, scene.T_world_object, scene.radii_m, strict=True):
+            if len(rows := near[self._below(across, T[:3, 3], radius_m)]):
+                local = into_frame(T, starts_m.take(rows, axis=0), towards[: len(rows)])
+                dark[rows] |= occluded(rays, *local, limits[rows])
+        return dark
 
-
-def _below_sphere(points_m: F32, to_light: F32, centre_m: F64, radius_m: float) -> I64:
-    """Rows of points (N, 3) whose ray to the light passes through the sphere."""
-    rel = centre_m.astype(np.float32) - points_m
-    along = rel @ to_light
-    gap2 = np.einsum("ij,ij->i", rel, rel) - along**2
-    return np.flatnonzero((gap2 < radius_m**2) & (along > -radius_m))
+    def _below(self, across: F32, centre_m: F64, radius_m: float) -> I64:
+        """Rows of points (3, N), along `axes`, whose ray to the light passes through the sphere."""
+        along, left, up = (self.axes @ centre_m.astype(np.float32))[:, None] - across
+        return np.flatnonzero((left * left + up * up < radius_m**2) & (along > -radius_m))
 
 
 def _outside(eye_m: F32, rays: F32, rooms: Sequence[Room], ceiling_m: float) -> F32:

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
-from datagen.workers.rendering import Camera
+from datagen.workers.houses import open_houses
+from datagen.workers.houses.glb import read_glb
+from datagen.workers.houses.house import House
+from datagen.workers.rendering import Camera, Frame
 from datagen.workers.rendering.embree import ray_scene, render_embree
 from datagen.workers.rendering.shading import draw_light, render_shaded
+from tests.workers.houses.house_files import two_rooms, write_houses
 from tests.workers.rendering.engines import cameras, mixed_stage
 from tests.workers.worlds import box_body, box_model, camera_at, stage_with, table_house
 
@@ -22,7 +32,7 @@ def test_light_changes_neither_depth_nor_bodies(camera: Camera) -> None:
     stage = mixed_stage()
     light = draw_light(camera, np.random.default_rng(0))
     shaded, plain = (
-        render_shaded(ray_scene(stage), stage.house.rooms, camera, light),
+        render_shaded(ray_scene(stage), stage.house, camera, light),
         render_embree(stage, camera),
     )
     assert (shaded.depth_m == plain.depth_m).all() and (shaded.body == plain.body).all()
@@ -39,7 +49,7 @@ def test_objects_and_furniture_cast_shadows_away_from_the_light() -> None:
         target, places = box_model("target", (0.02, 0.02, 0.02)), [(0.3, 0.3), (0.0, 0.0)]
         stage = stage_with([target, *objects], places[: 1 + len(objects)], table_house(furniture))
         bare = stage_with([target], places[:1], table_house())
-        frames = [render_shaded(ray_scene(s), s.house.rooms, ABOVE, FROM_THE_LEFT) for s in (stage, bare)]
+        frames = [render_shaded(ray_scene(s), s.house, ABOVE, FROM_THE_LEFT) for s in (stage, bare)]
         height, width = frames[0].depth_m.shape
         v, u = np.mgrid[:height, :width]
         T, depth_m = ABOVE.T_world_camera, frames[1].depth_m
@@ -60,7 +70,7 @@ def test_rooms_have_ceilings_and_openings_show_sky_and_ground() -> None:
     house = replace(house, bodies=tuple(b for b in house.bodies if b.body_id != "wall|4"))
     scene = ray_scene(stage_with([box_model("box", (0.1, 0.1, 0.1))], [(0.0, 0.9)], house))
     camera = camera_at((1.0, 1.5, 1.5), (4.0, 1.5, 1.6), 120, 160, 60.0)  # through the missing wall
-    frame = render_shaded(scene, house.rooms, camera, FROM_THE_LEFT)
+    frame = render_shaded(scene, house, camera, FROM_THE_LEFT)
     column = frame.rgb[:, 60].astype(int)
     empty = frame.body[:, 60] < 0
     assert not frame.depth_m[:, 60][empty].any()
@@ -68,3 +78,61 @@ def test_rooms_have_ceilings_and_openings_show_sky_and_ground() -> None:
     sky = column[np.flatnonzero(empty & (column != ceiling).any(1))[0]]
     assert np.ptp(ceiling) < 10 and ceiling.min() > 220
     assert sky[2] > sky[0] + 10 and ground[2] < ground[1] < 150
+
+
+def seen(house: House, camera: Camera) -> Frame:
+    stage = stage_with([box_model("box", (0.02, 0.02, 0.02))], [(0.0, 0.0)], house)
+    return render_shaded(ray_scene(stage), house, camera, FROM_THE_LEFT)
+
+
+def test_floors_have_the_pattern_of_their_material_in_pictures_alone(tmp_path: Path) -> None:
+    """The first room has a floor of wood, the second of carpet: joints of planks are dark lines."""
+    source = open_houses(f"procthor:{write_houses(tmp_path, [two_rooms()])}")
+    house = source.load("two-rooms")
+    assert set(house.materials.values()) == {"OakWood", "Carpet", "PureWhite"}
+    for x, is_wood in (3.3, True), (7.5, False):
+        camera = camera_at((x, 1.5, 1.6), (x, 1.9, 0.0), 200, 150, 260.0)
+        frame, plain = seen(house, camera), seen(replace(house, materials={}), camera)
+        assert (frame.depth_m == plain.depth_m).all() and (frame.body == plain.body).all()
+        floor = (plain.rgb == plain.rgb[75, 100]).all(2)
+        shares = frame.rgb[floor].mean(1) / plain.rgb[floor].mean(1)
+        assert floor.sum() > 5000 and shares.mean() == pytest.approx(1, abs=0.1)
+        assert (np.percentile(shares, 1) < 0.8 and shares.std() > 0.03) if is_wood else (shares == 1).all()
+        assert (seen(source.load("two-rooms"), camera).rgb == frame.rgb).all()
+
+
+def test_patterns_follow_the_name_and_the_house_and_far_joints_fade() -> None:
+    def bricks(camera: Camera, **more: object) -> np.ndarray:
+        house = replace(table_house(), **{"materials": {(230, 225, 210): "RedBrick"}, **more})
+        frame = seen(house, camera)
+        return frame.rgb[20:60, 60:140].astype(float)
+
+    near = camera_at((2.0, 1.2, 1.9), (2.0, 0.0, 1.9), 200, 150, 260.0)
+    far = camera_at((2.0, 2.9, 1.9), (2.0, 0.0, 1.9), 200, 150, 30.0)
+    wall = bricks(near)
+    assert (bricks(near) == wall).all() and (bricks(near, digest="cd" * 32) != wall).any()
+    assert bricks(near, materials={(230, 225, 210): "Drywall"}).std(axis=(0, 1)).max() < 1
+    assert wall.std() > 4 * bricks(far).std() > 0
+
+
+def test_base_colours_and_textures_of_meshes_appear_in_the_frame(tmp_path: Path) -> None:
+    """A face has one colour: that of its texture's middle, or its material's factor."""
+    boxes: list[Any] = []
+    for x, rgb, is_image in ((1.75, (200, 40, 30), True), (2.25, (30, 60, 200), False)):
+        box: Any = trimesh.creation.box(extents=(0.2, 0.2, 0.2))
+        box.apply_translation((x, 0.85, -1.5))
+        image = Image.new("RGB", (8, 8), rgb) if is_image else None
+        material = PBRMaterial(baseColorTexture=image, baseColorFactor=None if is_image else [*rgb, 255])
+        uv = np.full((len(box.vertices), 2), 0.5)
+        box.visual = TextureVisuals(uv=uv, material=material)
+        boxes.append(box)
+    data: Any = trimesh.Scene(boxes).export(file_type="glb")
+    (tmp_path / "a.glb").write_bytes(data)
+    turn = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    mesh = read_glb(tmp_path / "a.glb").transformed(turn)
+    body = replace(box_body("boxes", "small", "Box", (0.1, 0.1, 0.1), (0, 0, 0)), visual=mesh)
+    rgb = seen(table_house([body]), ABOVE).rgb.reshape(-1, 3).astype(float)
+    for expected in (200, 40, 30), (30, 60, 200):
+        hue = np.array(expected) / np.linalg.norm(expected)
+        hues = rgb / np.linalg.norm(rgb, axis=1, keepdims=True)
+        assert (np.linalg.norm(hues - hue, axis=1) < 0.03).sum() > 100
