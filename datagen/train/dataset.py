@@ -16,7 +16,6 @@ from typing_extensions import TypedDict  # pydantic reads typing's from Python 3
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import concurrent_map
-from datagen.train.augment import Augmentation
 from datagen.train.batching import (
     SAMPLE_FIELDS,
     SCENE_FIELDS,
@@ -24,7 +23,6 @@ from datagen.train.batching import (
     candidate_rows,
     make_batch,
     stored_scenes,
-    stored_view,
 )
 from datagen.train.headings import is_other_side, side_deg_of
 from datagen.train.inputs import I64, Array, Batch
@@ -40,7 +38,6 @@ class _Draw(IntEnum):
 
     ORDER = 0
     CANDIDATES = 1
-    AUGMENT = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +143,6 @@ class SampleStream:
         seed: int = 0,
         buffer_shards: int = 8,
         houses: Callable[[str], bool] | None = None,
-        augment: Augmentation | None = None,
         extra: Sequence[str] = (),
         shuffle: bool = True,
         rank: int = 0,
@@ -161,11 +157,9 @@ class SampleStream:
         self.candidates_per_robot = candidates_per_robot
         self.seed = seed
         self.buffer_shards = buffer_shards
-        self.augment = augment
         self.shuffle = shuffle
 
-        needs = augment.fields if augment else ()
-        names = list(dict.fromkeys([*_CORE, *extra, *needs]))
+        names = list(dict.fromkeys([*_CORE, *extra]))
         uneven = tuple({"object_digest"} - set(names))
         parts = open_parts(paths, list(dict.fromkeys([*names, *TABLE_FIELDS])), allow_incomplete, uneven)
         self._extra = tuple(dict.fromkeys(extra))
@@ -283,18 +277,14 @@ class SampleStream:
         return dict(zip(scenes.tolist(), stored, strict=True))
 
     def _batch(self, scenes: Sequence[StoredScene], k: int) -> Batch[Array]:
-        views = []
+        chosen = []
         for scene in scenes:
             rng = np.random.default_rng([self.seed, k, _Draw.CANDIDATES, *scene.words])
-            rows = candidate_rows(scene.samples["robot_index"], self.candidates_per_robot, rng)
-            view = stored_view(scene, rows)
-            if self.augment is not None:
-                view = self.augment.apply(view, (self.seed, k, _Draw.AUGMENT, *scene.words))
-            views.append(view)
+            chosen.append(candidate_rows(scene.samples["robot_index"], self.candidates_per_robot, rng))
         extra = {
             dim: [name for name in self._extra if self._dims[name] == dim] for dim in ("scene", "sample")
         }
-        return make_batch(views, extra["scene"], extra["sample"])
+        return make_batch(scenes, chosen, extra["scene"], extra["sample"])
 
 
 def _refuse_below(field: str, value: int, least: int) -> None:

@@ -10,7 +10,6 @@ import torch
 from torch.utils.data import IterableDataset, get_worker_info
 from typing_extensions import Unpack
 
-from datagen.train.augment import Augmentation
 from datagen.train.dataset import SampleStream
 from datagen.train.inputs import Batch
 from datagen.train.tensors import to_torch
@@ -24,7 +23,6 @@ class StreamOptions(TypedDict, total=False):
     seed: int
     buffer_shards: int
     houses: Callable[[str], bool] | None
-    augment: Augmentation | None
     extra: Sequence[str]
     shuffle: bool
     rank: int
@@ -70,7 +68,7 @@ def stream(*paths: str | Path, **options: Unpack[StreamOptions]) -> TorchStream:
         paths: Folders or `s3://` addresses of runs, merged runs or sealed `data.zarr` stores.
         options: `scenes_per_batch` [16], `candidates_per_robot` [all], `seed` [0] of the order,
             `shuffle` [True], `buffer_shards` to shuffle in [8], `houses` (a function of house_id that
-            selects houses), `augment`, `extra` columns, `rank` and `world` of distributed training, and
+            selects houses), `extra` columns, `rank` and `world` of distributed training, and
             `allow_incomplete`.
 
     Raises:
