@@ -85,9 +85,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--houses", required=True, help="procthor:DIR with the benchmark's houses")
     parser.add_argument("--objects", required=True, help="ycb:DIR with the benchmark's objects")
     parser.add_argument("--out", required=True, help="folder for the runs")
-    parser.add_argument(
-        "--run", action="append", default=[], help="a run to make; repeat for more"
-    )
+    parser.add_argument("--run", action="append", default=[], help="a run to make; repeat for more")
     parser.add_argument("--workers", type=int, help="processes; 0: this one (default: one per core)")
     given = parser.parse_args(words)
     try:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from enum import IntEnum
 from pathlib import Path
 from typing import Annotated, Literal, NotRequired
 
@@ -30,14 +29,8 @@ from datagen.train.reader import load_shard
 from datagen.train.run_parts import JOIN_FIELDS, open_parts
 from datagen.train.scene_table import TABLE_FIELDS, PartSummary, read_scene_table
 
+_ORDER, _CANDIDATES = 0, 1  # independent streams of an epoch's generators
 _CORE = (*SCENE_FIELDS, *SAMPLE_FIELDS, *JOIN_FIELDS)
-
-
-class _Draw(IntEnum):
-    """Independent streams of an epoch's generators."""
-
-    ORDER = 0
-    CANDIDATES = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +229,7 @@ class SampleStream:
         """
         _refuse_below("epoch", k, 0)
         _refuse_below("skip_batches", skip_batches, 0)
-        rng = np.random.default_rng([self.seed, k, _Draw.ORDER]) if self.shuffle else None
+        rng = np.random.default_rng([self.seed, k, _ORDER]) if self.shuffle else None
         plan = plan_epoch(
             self._scenes.shard, self.scenes_per_batch, self.buffer_shards, rng, self.rank, self.world
         )
@@ -279,7 +272,7 @@ class SampleStream:
     def _batch(self, scenes: Sequence[StoredScene], k: int) -> Batch[Array]:
         chosen = []
         for scene in scenes:
-            rng = np.random.default_rng([self.seed, k, _Draw.CANDIDATES, *scene.words])
+            rng = np.random.default_rng([self.seed, k, _CANDIDATES, *scene.words])
             chosen.append(candidate_rows(scene.samples["robot_index"], self.candidates_per_robot, rng))
         extra = {
             dim: [name for name in self._extra if self._dims[name] == dim] for dim in ("scene", "sample")
