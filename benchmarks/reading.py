@@ -25,7 +25,6 @@ import zarr
 
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import SEALED, seal
-from datagen.train.augment import Augmentation, ColourJitter, DepthHoles, PointDropout, Rotation, SensorNoise
 from datagen.train.batching import SAMPLE_FIELDS as SAMPLES
 from datagen.train.batching import SCENE_FIELDS as SCENES
 from datagen.train.dataset import SampleStream
@@ -37,7 +36,6 @@ REPEATS = 5
 FIELDS = (*SCENES, *SAMPLES, "sample_scene_index")
 STREAMED = (*FIELDS, "scene_index")
 TRAINED_A_SECOND = 4000  # docs/guides/read-data.md
-ALL = Augmentation(SensorNoise(), DepthHoles(), PointDropout(), ColourJitter(), Rotation())
 
 
 def main() -> None:
@@ -103,7 +101,6 @@ def _print_rates(folder: Path) -> None:
         ("chunks", "by whole shard", _rate(lambda: _chunks(folder / SEALED))),
         ("stream", "stored order", _rate(lambda: _stream(folder, shuffle=False))),
         ("stream", "shuffled, 8 shards", _rate(lambda: _stream(folder))),
-        ("stream", "with all augmentations", _rate(lambda: _stream(folder, augment=ALL))),
         ("tensorstore", "by whole shard", _rate(lambda: _tensorstore_shards(folder))),
         ("tensorstore", "random, 64 in flight", _rate(lambda: _tensorstore_random(folder, 2000))),
         ("zarr-python", "by whole shard", _rate(lambda: _zarr_shards(folder))),

@@ -194,7 +194,7 @@ def print_maniskill(
     """The same trials in ManiSkill: time, ratio, agreement."""
     import gymnasium
 
-    from datagen.workers.trials.maniskill_env import ENV_ID, DatagenGraspEnv, GraspTask, execute_plans
+    from examples.maniskill.environment import ENV_ID, DatagenGraspEnv, GraspTask, execute_plans
 
     spent_s, agree = 0.0, 0
     for case, scene, result in zip(cases, prepare_all(cases, trial), results, strict=False):

@@ -24,7 +24,7 @@ def main(folder: str, address: str = "local") -> None:
         print(f"{run}: {result.remaining} shards missing, {len(result.quarantined)} in quarantine")
 
     merged = datagen.merge(runs, out=f"{folder}/merged")
-    print(f"{merged['out']}: {merged['labels']} labels, {merged['useful_wall_s']:.0f} s of work")
+    print(f"{merged['out']}: {merged['labels']} labels")
     table = datagen.candidates(merged["out"], columns=["run", "label", "cost_s"])
     print(table.groupby("run", observed=True).agg({"label": "mean", "cost_s": "sum"}).round(2))
 

@@ -107,22 +107,9 @@ def calibrate(
         for name, words in _METRICS.items()
     ]
     print_rows(f"{title}: {out}", rows, ("", "before", "after", "gain", "fitted houses"))
-    rows = [
-        (
-            name,
-            str(report["heuristic"]["before"][name]),
-            str(value),
-            _range([f[name] for f in report["folds"]]),
-        )
-        for name, value in report["heuristic"]["after"].items()
-    ]
-    print_rows("[heuristic]", rows, ("", "before", "after", "over folds"))
+    old, new = report["heuristic"]["before"], report["heuristic"]["after"]
+    print_rows("[heuristic]", [(n, str(old[n]), str(new[n])) for n in new], ("", "before", "after"))
     return 0
-
-
-def _range(values: Sequence[Any]) -> str:
-    each = sorted(set(values))
-    return str(each[0]) if len(each) == 1 else f"{each[0]} .. {each[-1]}"
 
 
 def _specifications(paths: Sequence[str], candidates: Sets) -> list[Specification]:

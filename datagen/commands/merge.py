@@ -10,17 +10,12 @@ from cyclopts import Parameter
 
 from datagen.console.command_lines import absolute_path, command_line, prints, resumable, words_of
 from datagen.console.options import AsJson, PathOrAddress
-from datagen.console.printing import print_json, print_rows, seconds, summary_of_stored
+from datagen.console.printing import print_json, print_rows, summary_of_stored
 from datagen.display.progress import steps
-from datagen.reports.audit import account_for
 from datagen.schemas.merging import MergePlan, MergeResult, WrittenPart, merge_runs, plan_merge
 from datagen.schemas.run import Run, label_counts, open_runs
 
-_WORDS = {
-    "there_before": "merged before",
-    "copied": "copied",
-    "held_more_than_once": "duplicates",
-}
+_WORDS = {"there_before": "merged before", "copied": "copied", "held_more_than_once": "duplicates"}
 
 
 def print_merged(report: dict[str, Any], json: bool, **_: Any) -> int:
@@ -39,25 +34,18 @@ def _print_rows(report: dict[str, Any]) -> None:
     out = report["out"]
     rows = [
         ("labels", f"{report['labels']:,} of {report['n']:,}{state}"),
-        (
-            "worker time",
-            f"{seconds(report['total_wall_s'])}, of which {seconds(report['useful_wall_s'])} useful",
-        ),
         ("store", f"{report['sealed']}: zarr.open or xarray.open_zarr reads it" if report["sealed"] else "-"),
     ]
     if missing:
         rows.append(("resume with", command_line(["resume", out])))
     print_rows(f"merged: {out}", rows)
     for part in report["runs"]:
-        shards = part["shards"]
-        counts = [f"{shards[k]} {word}" for k, word in _WORDS.items() if shards[k]]
-        print_rows(
-            f"run {part['spec_hash'][:16]}, seed {part['seed']}, {part['split']} of {part['houses']} houses",
-            [
-                ("labels", f"{part['labels']:,} of {part['n']:,}"),
-                ("shards", ", ".join(counts) or "none"),
-            ],
+        counts = [f"{part['shards'][k]} {word}" for k, word in _WORDS.items() if part["shards"][k]]
+        shards = ("shards", ", ".join(counts) or "none")
+        title = (
+            f"run {part['spec_hash'][:16]}, seed {part['seed']}, {part['split']} of {part['houses']} houses"
         )
+        print_rows(title, [("labels", f"{part['labels']:,} of {part['n']:,}"), shards])
 
 
 @prints(print_merged)
@@ -81,7 +69,7 @@ def merge(
         out: Folder or s3:// address of the result, which may exist.
 
     Returns:
-        Labels, shards, cost and origin of each part, as `datagen merge --json` prints them.
+        Labels, shards and origin of each part, as `datagen merge --json` prints them.
 
     Raises:
         InputError: The runs cannot be merged, or one is damaged.
@@ -103,17 +91,15 @@ def merge(
 
 
 def merge_report(planned: MergePlan, result: MergeResult) -> dict[str, Any]:
-    """Return what was merged as plain values; times in seconds."""
+    """Return what was merged as plain values."""
     parts = open_runs(result.storage)
     done = {w.run.storage.url: w for w in result.written}
-    spending = account_for(parts)
+    counts = label_counts(parts)
     return {
         "out": result.storage.url,
-        "labels": label_counts(parts).labels,
-        "n": label_counts(parts).n,
+        "labels": counts.labels,
+        "n": counts.n,
         "sealed": result.sealed,
-        "total_wall_s": spending.useful.wall_s + spending.wasted.wall_s,
-        "useful_wall_s": spending.useful.wall_s,
         "runs": [_part(run, done.get(run.storage.url)) for run in parts],
     }
 
@@ -134,5 +120,4 @@ def _part(run: Run, written: WrittenPart | None) -> dict[str, Any]:
             "copied": written.copied if written else 0,
             "held_more_than_once": written.spare if written else 0,
         },
-        "attempts": len(run.ledger.attempts()),
     }

@@ -6,9 +6,9 @@ import os
 import sys
 import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -17,10 +17,9 @@ from datagen.console.command_lines import Interrupted, interruptible, options_of
 from datagen.console.options import AllowIncomplete, AsJson, File, PathOrAddress, PathsOrAddresses, Whole
 from datagen.console.printing import print_json, print_rows, seconds, summary_of_stored
 from datagen.released import checkpoint_file
-from datagen.schemas.errors import InputError, choices
+from datagen.schemas.errors import InputError
 
 if TYPE_CHECKING:
-    from datagen.train.augment import Augmentation
     from datagen.train.training.checkpoints import CheckpointHead, EpochRecord
 else:
     CheckpointHead = Any  # the command line resolves it, without importing torch
@@ -92,7 +91,6 @@ class TrainOptions:
         house_share: Share of the houses to train on, for learning curves.
         lr: Highest learning rate. [default: 0.002; 0.001 in stage2]
         seed: Seed of weights, order and dropout.
-        augment: Effects, comma-separated: noise, holes, dropout, colour, rotation.
         encoded: Folder for encoded inputs of `shared`: written once, read by later trainings.
         device: Device of the model.
         threads: Threads. [default: all cores]
@@ -111,7 +109,6 @@ class TrainOptions:
     house_share: float = 1.0
     lr: float | None = None
     seed: Whole = 0
-    augment: str | None = None
     encoded: PathOrAddress | None = None
     device: Literal["auto", "cpu", "cuda"] = "auto"
     threads: Whole | None = None
@@ -169,7 +166,6 @@ def train_model(given: TrainOptions) -> CheckpointHead:
     stage = STAGES[given.stage]
     start = None if given.init is None else checkpoint_file(str(given.init)) or str(given.init)
     began = read_checkpoint(start).head if start else None
-    augmentation, effects = read_augmentation(given.augment)
     options = Options(
         stage=given.stage,
         model=given.model or (began.model if began else "shared"),
@@ -179,17 +175,15 @@ def train_model(given: TrainOptions) -> CheckpointHead:
         lr=stage.lr if given.lr is None else given.lr,
         weight_decay=stage.weight_decay,
         seed=given.seed,
-        augment=effects,
     )
     job = TrainingJob(
         options,
         tuple(map(str, given.runs)),
         tuple(map(str, given.val or ())),
         str(given.out),
-        augmentation,
-        start,
-        choose_device(given.device),
-        threads,
+        init=start,
+        device=choose_device(given.device),
+        threads=threads,
         json_lines=given.json,
         allow_incomplete=given.allow_incomplete,
         encoded=None if given.encoded is None else str(given.encoded),
@@ -215,21 +209,6 @@ def model_sizes(words: Sequence[str]) -> dict[str, Any]:
         except (ValueError, RecursionError):
             sizes[name.strip()] = text
     return sizes
-
-
-def read_augmentation(word: str | None) -> tuple[Augmentation | None, dict[str, Any]]:
-    """Read `--augment`, names of effects with their default numbers; return it also as plain data."""
-    if word is None:
-        return None, {}
-    from datagen.train.augment import Augmentation
-
-    kinds = {name: get_args(kind)[0] for name, kind in get_type_hints(Augmentation).items()}
-    names = [name.strip() for name in word.split(",")]
-    for name in names:
-        if name not in kinds:
-            raise InputError("--augment", name, "is not an effect", choices(kinds, name))
-    effects = {name: kinds[name]() for name in names}
-    return Augmentation(**effects), {name: asdict(effect) for name, effect in effects.items()}
 
 
 def _all_cores() -> int:

@@ -12,13 +12,9 @@ import numpy.typing as npt
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import facing_rad
 from datagen.train.inputs import (
-    F32,
-    F64,
     I64,
-    U8,
     Array,
     Batch,
-    Bools,
     CandidateInputs,
     Clouds,
     Ints,
@@ -45,19 +41,6 @@ class StoredScene:
     def words(self) -> tuple[int, ...]:
         """Seed of the scene: its first sample's id, as four numbers."""
         return tuple(np.ascontiguousarray(self.samples["sample_id"][0]).view("<u4").tolist())
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A scene in one epoch: the cloud and the selected candidates, as rows of the scene's samples."""
-
-    scene: StoredScene
-    rows: Rows  # (k,)
-    points_m: F32  # (P, 3), target frame
-    rgb: U8  # (P, 3)
-    target_mask: Bools  # (P,)
-    n_points: int
-    base_xy_m: F64  # (k, 2), target frame
 
 
 def stored_scenes(
@@ -99,21 +82,6 @@ def stored_scenes(
     ]
 
 
-def stored_view(scene: StoredScene, rows: Rows) -> View:
-    """The scene as stored."""
-    record = scene.record
-    n_points = int(record["n_points"])
-    return View(
-        scene=scene,
-        rows=rows,
-        points_m=record["points_m"].astype(np.float32),
-        rgb=record["rgb"],
-        target_mask=record["target_mask"],
-        n_points=n_points,
-        base_xy_m=scene.samples["base_xy_m"][rows].astype(np.float64) - record["target_center_m"][:2],
-    )
-
-
 def candidate_rows(robot_index: Ints, per_robot: int | None, rng: np.random.Generator) -> Rows:
     """Rows by ascending robot, in stored order; at most `per_robot` random ones of each robot."""
     if per_robot is None:
@@ -126,50 +94,52 @@ def candidate_rows(robot_index: Ints, per_robot: int | None, rng: np.random.Gene
 
 
 def make_batch(
-    views: Sequence[View], extra_scene: Sequence[str] = (), extra_sample: Sequence[str] = ()
+    scenes: Sequence[StoredScene],
+    chosen: Sequence[Rows],
+    extra_scene: Sequence[str],
+    extra_sample: Sequence[str],
 ) -> Batch[Array]:
-    """Join the scenes into one batch, in order. Extra columns are as stored."""
+    """Join scenes into one batch, in order, with the candidates at the chosen rows of their samples.
+
+    Extra columns are as stored.
+    """
+
+    def stored(name: str) -> Array:
+        return _native(np.stack([np.asarray(scene.record[name]) for scene in scenes]))
 
     def sampled(name: str) -> Array:
-        return _native(np.concatenate([v.scene.samples[name][v.rows] for v in views]))
+        return _native(
+            np.concatenate([s.samples[name][rows] for s, rows in zip(scenes, chosen, strict=True)])
+        )
 
-    scene_row = np.repeat(np.arange(len(views)), [len(v.rows) for v in views])
+    scene_row = np.repeat(np.arange(len(scenes)), [len(rows) for rows in chosen])
     robot_index = sampled("robot_index")
     new = np.ones(len(scene_row), np.bool_)
     new[1:] = (np.diff(scene_row) != 0) | (np.diff(robot_index) != 0)
-    records = [v.scene.record for v in views]
     of_robots = scene_row[new].astype(np.int64), *(sampled(name)[new] for name in ROBOT_FIELDS)
-    names = np.array([v.scene.robot for v in views], np.str_)
+    names = np.array([scene.robot for scene in scenes], np.str_)
+    center_m, base_m = stored("target_center_m"), sampled("base_xy_m").astype(np.float64)
+    target_m = center_m[scene_row, :2]
+    turn_rad = sampled("base_yaw_rad") - facing_rad(target_m - base_m)
     return Batch(
         clouds=Clouds(
-            points_m=np.stack([v.points_m for v in views]),
-            rgb=np.stack([v.rgb for v in views]),
-            target_mask=np.stack([v.target_mask for v in views]),
-            n_points=np.array([v.n_points for v in views], np.int64),
-            target_height_m=np.array([r["target_center_m"][2] for r in records], np.float32),
-            target_radius_m=np.array([r["target_radius_m"] for r in records], np.float32),
+            points_m=stored("points_m").astype(np.float32),
+            rgb=stored("rgb"),
+            target_mask=stored("target_mask"),
+            n_points=stored("n_points").astype(np.int64),
+            target_height_m=center_m[:, 2].astype(np.float32),
+            target_radius_m=stored("target_radius_m").astype(np.float32),
         ),
         robots=RobotInputs(*of_robots, name=names[of_robots[0]]),
         candidates=CandidateInputs(
             robot_row=(np.cumsum(new) - 1).astype(np.int64),
-            base_xy_m=np.concatenate([v.base_xy_m for v in views]).astype(np.float32),
-            turn_rad=np.concatenate([_turns_rad(v) for v in views]).astype(np.float32),
+            base_xy_m=(base_m - target_m).astype(np.float32),
+            turn_rad=((turn_rad + np.pi) % (2 * np.pi) - np.pi).astype(np.float32),
         ),
         label=sampled("label").astype(np.int64),
         sample_id=sampled("sample_id"),
-        extra={
-            **{name: _native(np.stack([np.asarray(r[name]) for r in records])) for name in extra_scene},
-            **{name: sampled(name) for name in extra_sample},
-        },
+        extra={name: stored(name) for name in extra_scene} | {name: sampled(name) for name in extra_sample},
     )
-
-
-def _turns_rad(view: View) -> F64:
-    """Headings (k,) from the directions to the target; they do not change where the scene is rotated."""
-    samples, rows = view.scene.samples, view.rows
-    towards_m = view.scene.record["target_center_m"][:2] - samples["base_xy_m"][rows].astype(np.float64)
-    turn_rad = samples["base_yaw_rad"][rows] - facing_rad(towards_m)
-    return (turn_rad + np.pi) % (2 * np.pi) - np.pi
 
 
 def _native(values: Array) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from enum import IntEnum
 from pathlib import Path
 from typing import Annotated, Literal, NotRequired
 
@@ -16,7 +15,6 @@ from typing_extensions import TypedDict  # pydantic reads typing's from Python 3
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import concurrent_map
-from datagen.train.augment import Augmentation
 from datagen.train.batching import (
     SAMPLE_FIELDS,
     SCENE_FIELDS,
@@ -24,7 +22,6 @@ from datagen.train.batching import (
     candidate_rows,
     make_batch,
     stored_scenes,
-    stored_view,
 )
 from datagen.train.headings import is_other_side, side_deg_of
 from datagen.train.inputs import I64, Array, Batch
@@ -32,15 +29,8 @@ from datagen.train.reader import load_shard
 from datagen.train.run_parts import JOIN_FIELDS, open_parts
 from datagen.train.scene_table import TABLE_FIELDS, PartSummary, read_scene_table
 
+_ORDER, _CANDIDATES = 0, 1  # independent streams of an epoch's generators
 _CORE = (*SCENE_FIELDS, *SAMPLE_FIELDS, *JOIN_FIELDS)
-
-
-class _Draw(IntEnum):
-    """Independent streams of an epoch's generators."""
-
-    ORDER = 0
-    CANDIDATES = 1
-    AUGMENT = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +136,6 @@ class SampleStream:
         seed: int = 0,
         buffer_shards: int = 8,
         houses: Callable[[str], bool] | None = None,
-        augment: Augmentation | None = None,
         extra: Sequence[str] = (),
         shuffle: bool = True,
         rank: int = 0,
@@ -161,11 +150,9 @@ class SampleStream:
         self.candidates_per_robot = candidates_per_robot
         self.seed = seed
         self.buffer_shards = buffer_shards
-        self.augment = augment
         self.shuffle = shuffle
 
-        needs = augment.fields if augment else ()
-        names = list(dict.fromkeys([*_CORE, *extra, *needs]))
+        names = list(dict.fromkeys([*_CORE, *extra]))
         uneven = tuple({"object_digest"} - set(names))
         parts = open_parts(paths, list(dict.fromkeys([*names, *TABLE_FIELDS])), allow_incomplete, uneven)
         self._extra = tuple(dict.fromkeys(extra))
@@ -242,7 +229,7 @@ class SampleStream:
         """
         _refuse_below("epoch", k, 0)
         _refuse_below("skip_batches", skip_batches, 0)
-        rng = np.random.default_rng([self.seed, k, _Draw.ORDER]) if self.shuffle else None
+        rng = np.random.default_rng([self.seed, k, _ORDER]) if self.shuffle else None
         plan = plan_epoch(
             self._scenes.shard, self.scenes_per_batch, self.buffer_shards, rng, self.rank, self.world
         )
@@ -283,18 +270,14 @@ class SampleStream:
         return dict(zip(scenes.tolist(), stored, strict=True))
 
     def _batch(self, scenes: Sequence[StoredScene], k: int) -> Batch[Array]:
-        views = []
+        chosen = []
         for scene in scenes:
-            rng = np.random.default_rng([self.seed, k, _Draw.CANDIDATES, *scene.words])
-            rows = candidate_rows(scene.samples["robot_index"], self.candidates_per_robot, rng)
-            view = stored_view(scene, rows)
-            if self.augment is not None:
-                view = self.augment.apply(view, (self.seed, k, _Draw.AUGMENT, *scene.words))
-            views.append(view)
+            rng = np.random.default_rng([self.seed, k, _CANDIDATES, *scene.words])
+            chosen.append(candidate_rows(scene.samples["robot_index"], self.candidates_per_robot, rng))
         extra = {
             dim: [name for name in self._extra if self._dims[name] == dim] for dim in ("scene", "sample")
         }
-        return make_batch(views, extra["scene"], extra["sample"])
+        return make_batch(scenes, chosen, extra["scene"], extra["sample"])
 
 
 def _refuse_below(field: str, value: int, least: int) -> None:

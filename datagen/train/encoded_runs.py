@@ -1,8 +1,8 @@
 """Tokens of all robots of runs in one memory-mapped file, with the columns that training needs.
 
 A folder `<key>` holds `tokens.f16` (R, J, F) and `columns.npz`. The key is the digest of its origin: ids and
-labels of the samples, and the sizes of the tokens. Tokens have no parameters and clouds are not augmented, as
-in `datagen train` without --augment, so a training from them has the same inputs up to half precision.
+labels of the samples, and the sizes of the tokens. Tokens have no parameters, so a training from them
+has the same inputs up to half precision.
 """
 
 from __future__ import annotations

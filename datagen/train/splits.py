@@ -50,12 +50,11 @@ def split_by_house(
     """(training, validation) streams of runs: nine tenths of the houses, and the tenth that is held out.
 
     `share` is the part of the nine tenths to train on. `options` are those of SampleStream for training;
-    validation is neither shuffled nor augmented. InputError where a side has no
-    house.
+    validation is not shuffled. InputError where a side has no house.
     """
-    plain: dict[str, Any] = {"shuffle": False, "augment": None}
+    plain: dict[str, Any] = {**options, "shuffle": False}
     try:
-        validation = SampleStream(paths, **(options | plain), houses=HouseSide(held_out=True))
+        validation = SampleStream(paths, **plain, houses=HouseSide(held_out=True))
         train = SampleStream(paths, **options, houses=HouseShare(share, HouseSide(held_out=False)))
     except InputError as error:
         if error.field != "house_id":

@@ -2,34 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TypedDict
+from typing import Any
 
 import torch
 from torch.utils.data import IterableDataset, get_worker_info
-from typing_extensions import Unpack
 
-from datagen.train.augment import Augmentation
 from datagen.train.dataset import SampleStream
 from datagen.train.inputs import Batch
 from datagen.train.tensors import to_torch
-
-
-class StreamOptions(TypedDict, total=False):
-    """Options of SampleStream."""
-
-    scenes_per_batch: int
-    candidates_per_robot: int | None
-    seed: int
-    buffer_shards: int
-    houses: Callable[[str], bool] | None
-    augment: Augmentation | None
-    extra: Sequence[str]
-    shuffle: bool
-    rank: int
-    world: int
-    allow_incomplete: bool
 
 
 class TorchStream(SampleStream, IterableDataset[Batch[torch.Tensor]]):
@@ -40,7 +22,7 @@ class TorchStream(SampleStream, IterableDataset[Batch[torch.Tensor]]):
     where in it to begin: a training that stopped after `skip_batches` batches continues with the next.
     """
 
-    def __init__(self, paths: Sequence[str | Path], **options: Unpack[StreamOptions]) -> None:
+    def __init__(self, paths: Sequence[str | Path], **options: Any) -> None:
         super().__init__(paths, **options)
         # Shared, so that the processes of a loader with persistent workers see what `set_epoch` sets.
         self._begin = torch.zeros(2, dtype=torch.int64).share_memory_()
@@ -60,7 +42,7 @@ class TorchStream(SampleStream, IterableDataset[Batch[torch.Tensor]]):
         return self.batches_per_epoch - min(int(self._begin[1]), self.batches_per_epoch)
 
 
-def stream(*paths: str | Path, **options: Unpack[StreamOptions]) -> TorchStream:
+def stream(*paths: str | Path, **options: Any) -> TorchStream:
     """Return the labels of runs as a torch IterableDataset of batches, for a training loop of your own.
 
     A batch holds whole scenes: their clouds, the robots that look at them, the candidate base poses and
@@ -70,7 +52,7 @@ def stream(*paths: str | Path, **options: Unpack[StreamOptions]) -> TorchStream:
         paths: Folders or `s3://` addresses of runs, merged runs or sealed `data.zarr` stores.
         options: `scenes_per_batch` [16], `candidates_per_robot` [all], `seed` [0] of the order,
             `shuffle` [True], `buffer_shards` to shuffle in [8], `houses` (a function of house_id that
-            selects houses), `augment`, `extra` columns, `rank` and `world` of distributed training, and
+            selects houses), `extra` columns, `rank` and `world` of distributed training, and
             `allow_incomplete`.
 
     Raises:

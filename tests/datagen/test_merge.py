@@ -94,7 +94,7 @@ def test_it_says_what_came_from_where_and_what_is_missing(tmp_path: Path, capsys
     make_run(tmp_path / "b", 40)
     assert cli.run(command) == 0
     told = " ".join(capsys.readouterr().out.split())
-    assert "labels 40 of 40 worker time" in told, told
+    assert "labels 40 of 40 store" in told, told
     assert "3 merged before, 1 copied" in told
     assert "datagen resume" not in told
 

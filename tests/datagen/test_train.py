@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from datagen import cli
-from datagen.commands.train import model_sizes, read_augmentation
+from datagen.commands.train import model_sizes
 from datagen.released import released_checkpoint
 from datagen.schemas.errors import InputError
 from datagen.train.training.checkpoints import load_model, read_checkpoint
@@ -53,7 +53,7 @@ def test_both_stages_from_the_command_line(
     first: Path, sim_run: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ):
     out = tmp_path / "two.ckpt"
-    more = ("--init", str(first), "--epochs", "2", "--augment", "rotation,dropout")
+    more = ("--init", str(first), "--epochs", "2")
     arguments = words("stage2", sim_run, out, *more)
     capfd.readouterr()
     assert cli.run([*arguments, "--json"]) == 0
@@ -73,7 +73,6 @@ def test_both_stages_from_the_command_line(
     assert set(began.val_house_ids) <= {*head.house_ids, *head.val_house_ids}
     assert model.config == began.model_config
     assert not set(head.house_ids) & set(head.val_house_ids)
-    assert head.options["augment"].keys() == {"rotation", "dropout"}
     assert head.options["weight_decay"] == 0.01
     assert [run["schema"] for run in head.data] == ["sim"]
     assert json_of(capfd, arguments)["digest"] == head.digest
@@ -121,7 +120,6 @@ def test_what_cannot_be_trained_is_refused(
         (words("stage1", run, out, "--model-config", "width=x"), ("width",)),
         (words("stage1", run, out, "--model-config", "beauty=1"), ("beauty",)),
         (words("stage1", run, out, "--model-config", "none.toml"), ("none.toml",)),
-        (words("stage1", run, out, "--augment", "beauty"), ("beauty", "rotation")),
         (words("stage1", run, out, "--threads", "0"), ("--threads",)),
         (words("stage1", run, tmp_path), (str(tmp_path), "not a file")),
     ]
@@ -171,11 +169,6 @@ def test_a_gpu_that_is_not_there_is_refused():
     assert choose_device("auto") == "cpu"
 
 
-def test_sizes_of_a_model_and_default_numbers_of_effects(tiny: str):
+def test_sizes_of_a_model(tiny: str):
     asked = model_sizes([tiny, "width=16", "scales_m=[0.1, 0.2]", "camera=unknown"])
     assert asked == {**TINY, "width": 16, "scales_m": [0.1, 0.2], "camera": "unknown"}
-    augmentation, plain = read_augmentation("dropout, rotation")
-    assert augmentation is not None and augmentation.dropout is not None and augmentation.noise is None
-    assert augmentation.dropout.largest_share == plain["dropout"]["largest_share"] == 0.3
-    assert plain.keys() == {"dropout", "rotation"}
-    assert read_augmentation(None) == (None, {})

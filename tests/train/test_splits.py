@@ -9,7 +9,6 @@ import pytest
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import Source, Specification
-from datagen.train.augment import Augmentation, Rotation
 from datagen.train.dataset import SampleStream
 from datagen.train.run_parts import refuse_mixed_labels
 from datagen.train.splits import HouseShare, HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
@@ -64,13 +63,11 @@ def test_one_run_is_divided_by_house(tmp_path: Path):
         ):
             split_by_house([tmp_path / name])
     make_stream_run(tmp_path / "run", 6 * 18)
-    options = {"augment": Augmentation(rotation=Rotation())}
     places = [tmp_path / name for name in ("run", "in", "out")]
-    train, validation = split_by_house(places, scenes_per_batch=4, seed=3, **options)
+    train, validation = split_by_house(places, scenes_per_batch=4, seed=3)
     assert not train.house_ids() & validation.house_ids()
     assert train.n_scenes + validation.n_scenes == 24
-    assert (validation.shuffle, validation.augment) == (False, None)
-    assert (train.shuffle, train.seed, validation.seed) == (True, 3, 3)
+    assert (train.shuffle, validation.shuffle, train.seed, validation.seed) == (True, False, 3, 3)
     # Twins by content under two names, one on each side.
     make_stream_run(tmp_path / "twin", 18, seed=6, house_digest="in", house_id=twin)
     with pytest.raises(InputError, match="with equal content"):

@@ -40,7 +40,7 @@ class Options:
     house_share: float = 1.0  # of the houses that could be trained on; a larger share includes a smaller
     lr: float = 2e-3  # the highest of the schedule
     seed: int = 0
-    augment: Mapping[str, Any] = field(default_factory=dict)  # fields of Augmentation
+    augment: Mapping[str, Any] = field(default_factory=dict)  # always {}: older checkpoints may hold effects
     batch_scenes: int = 16
     weight_decay: float = 0.0  # on matrices alone: not on biases and norms
     warmup: float = 0.05  # share of the steps in which the rate rises from 0

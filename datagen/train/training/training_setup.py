@@ -14,7 +14,6 @@ from torch import Tensor
 
 from datagen.display.progress import Progress, Seen
 from datagen.schemas.errors import InputError
-from datagen.train.augment import Augmentation
 from datagen.train.dataset import SampleStream
 from datagen.train.encoded_runs import EncodedBatches, encode_runs, encoded_stream
 from datagen.train.headings import knows_headings, refuse_mixed_headings
@@ -54,7 +53,6 @@ class TrainingJob:
     runs: tuple[str, ...]
     val_runs: tuple[str, ...]  # empty: a share of the runs' houses is held out
     out: str
-    augment: Augmentation | None = None
     init: str | None = None
     device: str = "cpu"
     threads: int = 1
@@ -160,11 +158,11 @@ def _streams(job: TrainingJob) -> tuple[SampleStream, SampleStream]:
     }
     if job.val_runs:
         share = HouseShare(options.house_share)
-        train = SampleStream(job.runs, **common, augment=job.augment, houses=share)
+        train = SampleStream(job.runs, **common, houses=share)
         common["extra"] = _rate_fields(job, job.val_runs)
         val = SampleStream(job.val_runs, **common, shuffle=False)
     else:
-        train, val = split_by_house(job.runs, options.house_share, **common, augment=job.augment)
+        train, val = split_by_house(job.runs, options.house_share, **common)
     for stream in (train, val):
         _refuse_other_labels(options.stage, stream)
     parts = [summary.part for stream in (train, val) for summary in stream.parts]
@@ -185,7 +183,6 @@ def _encoded(
     options, folder = job.options, Path(job.encoded or "")
     excluded = {
         f"--model {model.name}": not isinstance(model, SharedModel),
-        "--augment": job.augment is not None,
         "runs of disturbed trials": bool(_rate_fields(job, job.runs)),
     }
     for name, is_given in excluded.items():

@@ -19,8 +19,8 @@ from datagen.workers.robots.assembly import read_trees
 from datagen.workers.robots.hulls import MAX_CORNERS, mesh_hulls, outer_hull, read_points
 from datagen.workers.robots.reach import Chain, largest_reach_m
 from datagen.workers.robots.resources import package_folders
-from datagen.workers.robots.robot_files import write_urdf
 from datagen.workers.robots.urdf import Inertial, UrdfTree, read_urdf, scaled_inertial
+from examples.maniskill.robot_files import write_urdf
 
 
 def tree_of(name: str) -> UrdfTree:

@@ -16,8 +16,8 @@ with warnings.catch_warnings():
     from sapien.wrapper.urdf_loader import URDFLoader
 
 from datagen.workers.robots.robot import Robot
-from datagen.workers.robots.robot_files import write_urdf
 from datagen.workers.trials.physics import ARM
+from examples.maniskill.robot_files import write_urdf
 from tests.workers.robots.robots_under_test import CASES, opened
 
 STEP_S = 1 / 200

@@ -61,10 +61,10 @@ def engine() -> Iterator[Any]:
     pytest.importorskip("mani_skill", reason="ManiSkill cannot be imported here")
     from sapien import physx
 
-    from datagen.workers.trials import maniskill_env
+    from examples.maniskill import environment
 
     scene, body, shape = physx.get_scene_config(), physx.get_body_config(), physx.get_shape_config()
-    yield maniskill_env
+    yield environment
     physx.set_scene_config(scene)
     physx.set_body_config(body)
     physx.set_shape_config(shape)

@@ -24,8 +24,8 @@ from mani_skill.agents.registration import register_agent
 
 from datagen.schemas.errors import InputError
 from datagen.workers.robots.robot import Robot
-from datagen.workers.robots.robot_files import write_urdf
 from datagen.workers.trials.drive_targets import FINGER_DAMPING, FINGER_STIFFNESS
+from examples.maniskill.robot_files import write_urdf
 
 
 class _FromLastTarget(PDJointPosController):

@@ -32,7 +32,6 @@ from datagen.workers.trials.drive_targets import (
     pressing_target_m,
 )
 from datagen.workers.trials.execute import HOLDS_SHARE, LIFTED_SHARE, RISEN_SHARE
-from datagen.workers.trials.maniskill_agent import agent_of
 from datagen.workers.trials.physics import (
     ARM,
     CARRIER,
@@ -49,6 +48,7 @@ from datagen.workers.trials.physics import (
     tune_shape,
 )
 from datagen.workers.trials.trial_scene import TrialScene, disturbed, pedestal_below, still_parts_near
+from examples.maniskill.agent import agent_of
 
 ENV_ID = "DatagenGrasp-v1"
 _MAX_TICKS = 1000
