@@ -69,7 +69,7 @@ _HEADINGS: dict[str, dict[str, tuple[str, str]]] = {
             "datagen.commands.calibrate:calibrate",
             "Fit the heuristic's parameters to trial labels.",
         ),
-        "benchmark": ("datagen.commands.benchmark:app", "Score methods on the frozen benchmark."),
+        "benchmark": ("datagen.commands.benchmark:app", "Make and score the frozen benchmark."),
         "predict": ("datagen.commands.predict:predict", "Find a base pose in a depth camera's frame."),
         "serve": ("datagen.commands.serve:serve", "Find base poses for programs, over HTTP."),
     },

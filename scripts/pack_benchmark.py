@@ -2,7 +2,7 @@
 
     python -m scripts.pack_benchmark RUNS OUT [--scenes 100] [--without-labels]
 
-RUNS is the folder of `make_benchmark.py`, OUT a new folder. `datagen benchmark score --runs OUT` and any
+RUNS is the folder of `datagen benchmark make`, OUT a new folder. `datagen benchmark score --runs OUT` and any
 Zarr reader open a pack. Equal runs give equal bytes.
 """
 

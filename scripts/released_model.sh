@@ -50,7 +50,7 @@ step training
 datagen train sim-only "${mixes[@]}" "${views[@]}" --val val --epochs "$EPOCHS" --model-config width=96 --model-config embedding=160 \
     --model-config kinematics=true --seed 1 --encoded inputs --threads 1 --out model.ckpt
 step "the benchmark's runs"
-python -m scripts.make_benchmark --houses "procthor:$ASSETS/procthor" --objects "ycb:$ASSETS/ycb" --out runs
+datagen benchmark make --houses "procthor:$ASSETS/procthor" --objects "ycb:$ASSETS/ycb" --out runs
 step scores
 [ board.json -nt model.ckpt ] || datagen benchmark score model.ckpt scalars reachability reach-share distance proximity \
     --runs runs --fit val --out board.json

@@ -1,4 +1,4 @@
-"""`datagen benchmark`: score methods on the runs of the frozen benchmark."""
+"""`datagen benchmark`: make the runs of the frozen benchmark, and score methods on them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,73 @@ from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 
-from datagen.console.command_lines import prints
-from datagen.console.options import AsJson, File, PathOrAddress, PathsOrAddresses
+from datagen.console.command_lines import (
+    Interrupted,
+    absolute_path,
+    absolute_source,
+    given_options,
+    prints,
+    words_of,
+)
+from datagen.console.options import AsJson, File, PathOrAddress, PathsOrAddresses, Whole
+from datagen.console.printing import print_rows
 from datagen.evaluation.output import output_file, print_report, write_report
+from datagen.jobs.job import JobOptions
+from datagen.jobs.job_report import print_job
 
-app = App(name="benchmark", help="Score methods on the frozen benchmark.")
+app = App(name="benchmark", help="Make the runs of the frozen benchmark, and score methods on them.")
+
+
+@app.command
+def make(
+    *,
+    houses: str,
+    objects: str,
+    out: Path,
+    run: Annotated[Sequence[str] | None, Parameter(metavar="NAME")] = None,
+    workers: Whole | None = None,
+) -> int:
+    """Make the runs of the benchmark in OUT, and compare their digests with the frozen ones.
+
+    The same command resumes. Houses, objects and engines must be those that the definition names: the same
+    specification gives the same labels on the same platform. A benchmark.json in OUT is another definition.
+
+    For example: datagen benchmark make --houses procthor:DIR --objects ycb:DIR --out runs
+
+    Args:
+        houses: procthor:DIR with the benchmark's houses.
+        objects: ycb:DIR with the benchmark's objects; OUT/objects gets their training and test parts.
+        out: Folder for the runs.
+        run: Run to make; repeat for more. [default: all]
+        workers: Worker processes; 0: this process, for debuggers. [default: one per core]
+    """
+    from datagen.evaluation.benchmark import read_benchmark, refuse_differing
+    from datagen.evaluation.benchmark_runs import divided_objects, make_runs
+
+    job_options = JobOptions(workers=workers)
+    job_options.refuse_bad()
+    folder = Path(absolute_path(out))
+    definition = read_benchmark(folder)
+    runs = definition.chosen(run or ())
+    houses, objects = absolute_source(houses), absolute_source(objects)
+    words = ["benchmark", "make", *words_of({"--houses": houses, "--objects": objects, "--out": folder})]
+    for name in run or ():
+        words += ["--run", name]
+    words += words_of(given_options(job_options))
+    parts = divided_objects(objects, folder, runs)
+    try:
+        for result in make_runs(runs, houses, parts, folder, job_options, words):
+            if print_job(result):
+                return result.exit_code
+    except Interrupted as stopped:
+        return print_job(stopped.result)
+    for name, wanted in runs.items():
+        refuse_differing(str(folder / name), name, wanted, definition.version)
+    rows = [
+        (n, "candidates and labels as frozen" if r.digests else "not frozen yet") for n, r in runs.items()
+    ]
+    print_rows(f"benchmark {definition.version} in {folder}", rows)
+    return 0
 
 
 @app.command
@@ -35,7 +97,7 @@ def score(
 
     Args:
         methods: Methods to compare.
-        runs: Folder with the benchmark's runs, or a pack; runs that it lacks are not scored.
+        runs: Folder with the runs of `datagen benchmark make`, or a pack; runs that it lacks are not scored.
             [default: the pack that comes with datagen]
         fit: Run in validation houses to fit baselines on; repeat for more.
         out: File to write, FILE.json.

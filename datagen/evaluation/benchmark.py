@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError, field_serializer
 
 from datagen.evaluation.methods import EvaluatedMethod
 from datagen.evaluation.runs import EvaluatedRun, draws_of
-from datagen.schemas.errors import InputError
+from datagen.schemas.errors import InputError, choices
 from datagen.schemas.identity import digest_of
 from datagen.schemas.record_files import different_fields
 from datagen.schemas.run_records import Digest, StoredRecord
@@ -83,6 +83,14 @@ class Benchmark(StoredRecord):
         }
         return digest_of({"version": self.version, "runs": runs})
 
+    def chosen(self, names: Sequence[str]) -> dict[str, BenchmarkRun]:
+        """The runs of these names, or all, in the definition's order. InputError for an unknown name."""
+        for name in names:
+            if name not in self.runs:
+                problem = f"is no run of benchmark {self.version}"
+                raise InputError("--run", name, problem, choices(self.runs, name))
+        return {name: run for name, run in self.runs.items() if not names or name in names}
+
     def record(self, scored: Mapping[str, BenchmarkRun]) -> dict[str, Any]:
         """Its entry in the report of the runs that were scored."""
         return {
@@ -117,7 +125,7 @@ def read_benchmark(folder: Path | None = None) -> Benchmark:
 def shipped_pack() -> Path:
     """The folder of the package's own pack. InputError where it has none."""
     if not (PACK / DEFINITION).exists():
-        fix = "Name runs of `scripts/make_benchmark.py`, or a pack"
+        fix = "Name runs of `datagen benchmark make`, or a pack"
         raise InputError("--runs", "", "is not given, and this version comes without a pack", fix)
     return PACK
 
@@ -131,7 +139,7 @@ def present_runs(folder: str, benchmark: Benchmark) -> dict[str, str]:
         elif _has(f"{folder}/{name}", "manifest.json"):
             found[name] = f"{folder}/{name}"
     if not found:
-        fix = "Make them with `python -m scripts.make_benchmark`"
+        fix = "Make them with `datagen benchmark make`"
         raise InputError(folder, "--runs", f"has no run of benchmark {benchmark.version}", fix)
     return found
 
@@ -168,7 +176,7 @@ def refuse_differing(path: str, name: str, wanted: BenchmarkRun, version: str) -
     Digests are compared if the definition has them.
     """
     definition = f"run {name} of benchmark {version}"
-    fix = f"Make it with `python -m scripts.make_benchmark --run {name}`, or copy the run"
+    fix = f"Make it with `datagen benchmark make --run {name}`, or copy the run"
     parts = open_parts([path], (*JOIN_FIELDS, "sample_id"))
     for part in parts:
         ours, theirs = (s.model_dump(mode="json") for s in (wanted.spec, part.specs[0]))
@@ -197,5 +205,5 @@ def refuse_trained_objects(run: EvaluatedRun, methods: Sequence[EvaluatedMethod]
             problem = (
                 f"{method.name} was trained on {len(shared)} of the {len(here)} objects that it holds out"
             )
-            fix = "Train on the objects of `datagen assets split` that are for training"
+            fix = "Train on OUT/objects/train of `benchmark make`"
             raise InputError(run.place, "object_digest", problem, fix)

@@ -174,7 +174,7 @@ def test_closed_streams_are_quiet(words: str, closed: str, tmp_path: Path) -> No
 
 HELPS = [
     *([verb] for verb in sorted(cli.VERBS)), ["assets", "fetch"], ["assets", "list"], ["assets", "split"],
-    ["benchmark", "score"],
+    ["benchmark", "make"], ["benchmark", "score"],
 ]  # fmt: skip
 
 

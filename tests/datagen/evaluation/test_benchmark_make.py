@@ -1,4 +1,4 @@
-"""`scripts/make_benchmark.py`: the same runs again, and the definition that the package ships."""
+"""`datagen benchmark make`: the same runs again, and the definition that the package ships."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
+from datagen import cli
 from datagen.cli import build_app
 from datagen.console.command_lines import Interrupted
 from datagen.evaluation.benchmark import read_benchmark
 from datagen.jobs.job import Job
 from datagen.jobs.job_report import JobResult
-from scripts import make_benchmark
 from tests.conftest import REPOSITORY
 from tests.sim_extra import needs_sim
 from tests.small_runs import arrays_of, assert_equal_runs
@@ -28,7 +28,7 @@ def made(out: Path, definition: dict[str, Any] | str, *more: str) -> int:
     text = definition if isinstance(definition, str) else json.dumps(definition)
     (out / "benchmark.json").write_text(text)
     sources = ["--houses", "builtin", "--objects", "builtin", "--workers", "0"]
-    return make_benchmark.main([*sources, "--out", str(out), *more])
+    return cli.run(["benchmark", "make", *sources, "--out", str(out), *more])
 
 
 @pytest.fixture
@@ -63,10 +63,10 @@ def test_an_interrupted_command_says_how_to_resume_itself(
     monkeypatch.setattr(Job, "run", stopped)
     assert made(tmp_path, definition, "--run", "test") == 130
     told = capsys.readouterr().err
-    assert f"interrupted; 1 shard left. Resume with:\n  datagen resume {tmp_path / 'test'}" in told
+    assert "interrupted; 1 shard left. Resume with:\n  datagen benchmark make --houses builtin" in told
     (line,) = [each for each in told.splitlines() if each.startswith("  datagen ")]
-    build_app("resume").parse_args(shlex.split(line)[1:], exit_on_error=False, print_error=False)
-    assert "--workers 0" in line
+    build_app("benchmark").parse_args(shlex.split(line)[1:], exit_on_error=False, print_error=False)
+    assert f"--out {tmp_path} --run test" in line
 
 
 @needs_sim
