@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import torch
 from torch.utils.data import IterableDataset, get_worker_info
+from typing_extensions import Unpack
 
 from datagen.train.dataset import SampleStream
 from datagen.train.inputs import Batch
 from datagen.train.tensors import to_torch
+
+
+class StreamOptions(TypedDict, total=False):
+    """Options of SampleStream."""
+
+    scenes_per_batch: int
+    candidates_per_robot: int | None
+    seed: int
+    buffer_shards: int
+    houses: Callable[[str], bool] | None
+    extra: Sequence[str]
+    shuffle: bool
+    rank: int
+    world: int
+    allow_incomplete: bool
 
 
 class TorchStream(SampleStream, IterableDataset[Batch[torch.Tensor]]):
@@ -22,7 +38,7 @@ class TorchStream(SampleStream, IterableDataset[Batch[torch.Tensor]]):
     where in it to begin: a training that stopped after `skip_batches` batches continues with the next.
     """
 
-    def __init__(self, paths: Sequence[str | Path], **options: Any) -> None:
+    def __init__(self, paths: Sequence[str | Path], **options: Unpack[StreamOptions]) -> None:
         super().__init__(paths, **options)
         # Shared, so that the processes of a loader with persistent workers see what `set_epoch` sets.
         self._begin = torch.zeros(2, dtype=torch.int64).share_memory_()
@@ -42,7 +58,7 @@ class TorchStream(SampleStream, IterableDataset[Batch[torch.Tensor]]):
         return self.batches_per_epoch - min(int(self._begin[1]), self.batches_per_epoch)
 
 
-def stream(*paths: str | Path, **options: Any) -> TorchStream:
+def stream(*paths: str | Path, **options: Unpack[StreamOptions]) -> TorchStream:
     """Return the labels of runs as a torch IterableDataset of batches, for a training loop of your own.
 
     A batch holds whole scenes: their clouds, the robots that look at them, the candidate base poses and
