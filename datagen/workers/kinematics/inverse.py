@@ -172,8 +172,7 @@ def tcp_jacobian(tree: KinematicTree, joints: F64, T: F64, out: F64) -> None:
 def _damped_step(J: F64, e: F64, damping: float, step: F64) -> None:
     """The change (A,) of the coordinates that leads along the twist e (6,): J (J^T J + damping I)^-1 e.
 
-    By Cholesky's decomposition L of the matrix (6, 6). Its numbers are variables, not an array: they stay in
-    registers, which makes this three times as fast.
+    By Cholesky's decomposition of the matrix (6, 6), whose numbers are variables: they stay in registers.
     """
     h00 = h10 = h11 = h20 = h21 = h22 = h30 = h31 = h32 = h33 = h40 = 0.0
     h41 = h42 = h43 = h44 = h50 = h51 = h52 = h53 = h54 = h55 = 0.0
