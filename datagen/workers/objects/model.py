@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -44,7 +45,7 @@ class ObjectSource(Protocol):
         ...
 
 
-class LoadedOnce:
+class LoadedOnce(ABC):
     """A source whose models are made by `_model` and kept; `_digests` has those of the usable objects."""
 
     kind: str
@@ -65,5 +66,6 @@ class LoadedOnce:
             self._models[name] = self._model(name)
         return self._models[name]
 
+    @abstractmethod
     def _model(self, name: str) -> ObjectModel:
-        raise NotImplementedError
+        """Read the object of a usable name."""
