@@ -46,11 +46,15 @@ for robot in $OTHERS; do
     submit "mix-$robot" "$robot" "$EACH" train "$seed"
     seed=$((seed + 1))
 done
-step training
+step "training, and beside it the benchmark's runs (runs.log)"
+# Training has one thread, since its bits depend on their number. Jobs in the background do not hear Ctrl-C.
+trap 'kill $(jobs -p) 2> /dev/null || true' EXIT
+"$BIN/datagen" benchmark make --houses "procthor:$ASSETS/procthor" --objects "ycb:$ASSETS/ycb" --out runs \
+    --workers "$(($(nproc) > 1 ? $(nproc) - 1 : 1))" > runs.log 2>&1 &
 datagen train sim-only "${mixes[@]}" "${views[@]}" --val val --epochs "$EPOCHS" --model-config width=96 --model-config embedding=160 \
     --model-config kinematics=true --seed 1 --encoded inputs --threads 1 --out model.ckpt
-step "the benchmark's runs"
-datagen benchmark make --houses "procthor:$ASSETS/procthor" --objects "ycb:$ASSETS/ycb" --out runs
+step "the rest of the benchmark's runs"
+wait "$!" || { tail -n 3 runs.log >&2 && exit 2; }
 step scores
 [ board.json -nt model.ckpt ] || datagen benchmark score model.ckpt scalars reachability reach-share distance proximity \
     --runs runs --fit val --out board.json

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -19,22 +20,44 @@ def test_the_page_is_up_to_date() -> None:
     assert kept == leaderboard_page.page(), "run `make docs`"
 
 
-def test_a_method_becomes_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_method_that_was_scored_on_the_pack_becomes_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     board = tmp_path / "board.json"
     words = ["benchmark", "score", "reach-share", "proximity", "--out", str(board)]
     assert cli.run(words) == 0
-    with pytest.raises(InputError, match="is not this version with all of its runs"):  # the pack is a part
-        leaderboard_page.main([str(board), "reach-share", "rule", "a rule"])
-    pack = read_benchmark(Path(shipped_pack()))
-    monkeypatch.setattr(leaderboard_page, "read_benchmark", lambda _: pack)
-    monkeypatch.setattr(leaderboard_page, "FOLDER", tmp_path / "entries")
+    some = json.loads(board.read_text())
+    entries = tmp_path / "entries"
+    shutil.copytree(leaderboard_page.FOLDER, entries)
+    monkeypatch.setattr(leaderboard_page, "FOLDER", entries)
+    for name, value in (("not_scored", ["grids-ur5"]), ("digest", "0" * 64)):
+        (tmp_path / "part.json").write_text(
+            json.dumps(some | {"benchmark": some["benchmark"] | {name: value}})
+        )
+        with pytest.raises(InputError, match="is not this version with all of its runs"):
+            leaderboard_page.main([str(tmp_path / "part.json"), "reach-share", "rule", "a rule"])
     with pytest.raises(InputError, match="Did you mean proximity"):
         leaderboard_page.main([str(board), "proximty", "rule", "a rule"])
-    for method in ("proximity", "reach-share"):
-        leaderboard_page.main([str(board), method, method, f"about {method}"])
-    part = json.loads(board.read_text())["parts"][0]
-    good = part["grids"]["methods"]["reach-share"]["good"]["value"]
-    entry = json.loads((tmp_path / "entries" / "reach-share.json").read_text())
-    assert part["title"] == "grids" and entry["grids"]["grids"]["good"][0] == round(100 * good, 1)
-    page = leaderboard_page.page()
-    assert "| reach-share | " in page and "- **proximity:** about proximity" in page
+    leaderboard_page.main([str(board), "reach-share", "mine", "about mine"])
+    good = some["parts"][0]["grids"]["methods"]["reach-share"]["good"]["value"]
+    entry = json.loads((entries / "pack" / "mine.json").read_text())
+    assert some["parts"][0]["title"] == "grids" and entry["grids"]["grids"]["good"][0] == round(100 * good, 1)
+    before, pack = leaderboard_page.page().split("## On the pack")
+    assert f"| mine | {round(100 * good, 1)}" in pack and "- **mine:** about mine" in pack
+    assert "mine" not in before
+
+
+def test_a_method_that_was_scored_on_all_runs_leads_the_other_tables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    board = tmp_path / "board.json"
+    assert cli.run(["benchmark", "score", "reach-share", "proximity", "--out", str(board)]) == 0
+    both = read_benchmark(shipped_pack())
+    folders = {tmp_path / "runs": both, tmp_path / "pack": both}
+    for folder in folders:
+        monkeypatch.setattr(leaderboard_page, "boards", lambda folder=folder: {folder: both})
+        for method in ("proximity", "reach-share"):
+            leaderboard_page.main([str(board), method, method, f"about {method}"])
+    monkeypatch.setattr(leaderboard_page, "boards", lambda: folders)
+    tables = [each.count("| reach-share | ") for each in leaderboard_page.page().split("## ")]
+    assert tables == [0, 1, 1, 1, 1, 1, 0, 0]
