@@ -10,7 +10,7 @@ Frame "target": world axes (z up) with the origin at the target's centre.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -45,22 +45,6 @@ class Clouds(Generic[A]):
 
     def __len__(self) -> int:
         return len(self.n_points)  # type: ignore[arg-type]
-
-
-# Orders of a cloud's points over which scores are averaged; more improve them little (explanation/models.md).
-ORDERS = 2
-
-
-def in_random_order(clouds: Clouds[A], k: int) -> Clouds[A]:
-    """The clouds with their valid points in random order `k`, the same for all clouds of as many points."""
-    points: Any = clouds.points_m
-    rows = np.tile(np.arange(points.shape[1]), (len(clouds), 1))
-    for row, n in zip(rows, map(int, clouds.n_points), strict=True):  # type: ignore[call-overload]
-        row[:n] = np.random.default_rng([k, n]).permutation(n)
-    at: Any = (np.arange(len(clouds))[:, None], rows)
-    rgb: Any = clouds.rgb
-    mask: Any = clouds.target_mask
-    return replace(clouds, points_m=points[at], rgb=rgb[at], target_mask=mask[at])
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,18 +23,7 @@ from safetensors import SafetensorError, safe_open
 from datagen.schemas.errors import InputError
 from datagen.train.hands.poses import poses_of_clouds
 from datagen.train.hands.reach import hand_reach, hands_of
-from datagen.train.inputs import (
-    F32,
-    F64,
-    ORDERS,
-    Array,
-    Batch,
-    CandidateInputs,
-    Clouds,
-    RobotInputs,
-    in_random_order,
-    is_clear,
-)
+from datagen.train.inputs import F32, F64, Array, Batch, CandidateInputs, is_clear
 from datagen.train.observed_visibility import visible_share
 
 ENCODE, SCORE = "encode", "score"  # functions of a program
@@ -85,44 +74,30 @@ class ProgramScorer:
         candidates = replace(_rows(batch.candidates, rows), robot_row=np.zeros(len(rows), np.int64))
         camera_rise_m = robot.camera_height_m - cloud.target_height_m
 
-        orders: list[dict[str, Array]] = []
-        for order in range(ORDERS):
-            given = _of_cloud(in_random_order(cloud, order), robot)
-            orders.append(dict(zip(TOKENS, self.program.run(ENCODE, given), strict=True)))
+        padded = [_of_length(each) for each in (cloud.points_m, cloud.rgb, cloud.target_mask)]
+        sizes = (cloud.target_height_m, robot.base_height_m, robot.arm_reach_m)
+        of_cloud: dict[str, Array] = dict(
+            zip(CLOUD, (*padded, cloud.n_points.astype(np.int64), *sizes), strict=True)
+        )
+        tokens: dict[str, Array] = dict(zip(TOKENS, self.program.run(ENCODE, of_cloud), strict=True))
         n_poses, hands = int(self.program.facts["hand_poses"]), hands_of(robot, 1)
         poses = poses_of_clouds(cloud.points_m, cloud.target_mask, cloud.n_points, n_poses, hands)
-        codes = hand_reach(poses, cloud, robot, candidates, orders[0]["rise_m"])
-        # No pose of the hand is within reach of the others: their score is 0.
-        able = np.flatnonzero(codes.any(axis=(1, 2)))
-        candidates, codes = _rows(candidates, able), codes[able]
-        rho = _visible_share(_of_cloud(cloud, robot), orders[0], candidates, float(camera_rise_m[0]))
-        own = {"base_xy_m": candidates.base_xy_m, "rho": rho, "codes": codes}
         reach_m = np.maximum(robot.arm_reach_m, _MIN_REACH_M)
-        shared = {"camera_rise_m": camera_rise_m, "reach_m": reach_m, "poses": poses}
-        chance = np.zeros(len(rows))
-        for tokens in orders:
-            chance[able] += self._chance(shared | tokens, own, len(able)) / ORDERS
-        return chance
-
-    def _chance(self, shared: Arrays, own: Arrays, n: int) -> F64:
-        """Probabilities (n,) of candidates with their `own` inputs."""
-        logits = [np.zeros((0, 2), np.float32)]
-        for start in range(0, n, AT_ONCE):
-            some = np.minimum(np.arange(start, start + AT_ONCE), n - 1)
-            logits += self.program.run(SCORE, {**shared, **{name: each[some] for name, each in own.items()}})
-        bad, good = np.concatenate(logits)[:n].astype(np.float64).T
+        shared = tokens | {"camera_rise_m": camera_rise_m, "reach_m": reach_m, "poses": poses}
+        rho = _visible_share(of_cloud, tokens, candidates, float(camera_rise_m[0]))
+        codes = hand_reach(poses, cloud, robot, candidates, tokens["rise_m"])
+        logits: list[F32] = []
+        for start in range(0, len(rows), AT_ONCE):
+            some = np.minimum(np.arange(start, start + AT_ONCE), len(rows) - 1)
+            own = {"base_xy_m": candidates.base_xy_m[some], "rho": rho[some], "codes": codes[some]}
+            logits += self.program.run(SCORE, shared | own)
+        bad, good = np.concatenate(logits)[: len(rows)].astype(np.float64).T
         return 1 / (1 + np.exp(bad - good))
 
 
 def _rows(table: T, rows: Array) -> T:
     columns = {name: value[rows] for name, value in vars(table).items() if isinstance(value, np.ndarray)}
     return replace(table, **columns)  # type: ignore[type-var]
-
-
-def _of_cloud(cloud: Clouds[Array], robot: RobotInputs[Array]) -> dict[str, Array]:
-    points = [_of_length(each) for each in (cloud.points_m, cloud.rgb, cloud.target_mask)]
-    sizes = (cloud.target_height_m, robot.base_height_m, robot.arm_reach_m)
-    return dict(zip(CLOUD, (*points, cloud.n_points.astype(np.int64), *sizes), strict=True))
 
 
 def _of_length(a: Array) -> Array:

@@ -59,7 +59,8 @@ class ModelScorer:
         try:
             with torch.inference_mode():
                 given = to_torch(batch, self.model.device)
-                chance = self.model.chance(given.clouds, given.candidates, given.robots).cpu().numpy()
+                logits = self.model.score(given.clouds, given.candidates, given.robots).double()
+                chance = torch.softmax(logits, dim=1)[:, 1].cpu().numpy()
         finally:
             self.model.train(trained)
         # NaN remains, also where the base is not clear.

@@ -16,10 +16,8 @@ from datagen.train.encoded_runs import (
     encoded_stream,
     open_encoded,
 )
-from datagen.train.inputs import Array, Batch
 from datagen.train.models.shared import SharedModel
 from datagen.train.scorers import ModelScorer
-from datagen.train.tensors import to_torch
 from tests.sim_extra import needs_sim
 from tests.train.models.made_batches import SMALL
 from tests.train.stream_runs import make_stream_run
@@ -44,14 +42,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> EncodedRuns:
     return encoded(folder / "run", folder / "encodings")
 
 
-@torch.inference_mode()
-def chances(model: SharedModel, batch: Batch[Array]) -> Array:
-    """Of the stored order of points, which is encoded; `ModelScorer` averages over others."""
-    given = to_torch(batch, "cpu")
-    logits = model.score(given.clouds, given.candidates, given.robots)
-    return torch.softmax(logits, dim=1)[:, 1].numpy()
-
-
 @pytest.mark.parametrize("kinematics", [False, pytest.param(True, marks=needs_sim)])
 def test_a_model_scores_encoded_candidates_as_it_scores_clouds(
     kinematics: bool, heuristic_run: Path, tmp_path: Path
@@ -61,7 +51,7 @@ def test_a_model_scores_encoded_candidates_as_it_scores_clouds(
     stream = encoded_stream([str(heuristic_run)], False)
     data = encode_runs(stream, model, tmp_path, no_progress)
     batches = list(stream.epoch(0))
-    plain = np.concatenate([chances(model, batch) for batch in batches])
+    plain = np.concatenate([ModelScorer(model, "model").score(batch) for batch in batches])
     again = EncodedBatches(data, np.arange(len(data.houses)), 4).epoch(0)
     scores = np.concatenate([ModelScorer(model, "model").score(batch) for batch in again])
     np.testing.assert_allclose(scores, plain, atol=2e-3)  # tokens have half precision

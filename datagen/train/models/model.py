@@ -40,12 +40,6 @@ class Model(nn.Module, ABC):
         """Logits (N, 2), float32; column 1 is "good". All tensors on the model's device."""
         return self(clouds, candidates, robots) if len(candidates) else candidates.base_xy_m.new_zeros((0, 2))
 
-    def chance(
-        self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
-    ) -> Tensor:
-        """Probabilities (N,) of "good", float64; a model may take more care here than in `score`."""
-        return torch.softmax(self.score(clouds, candidates, robots).double(), dim=1)[:, 1]
-
     @abstractmethod
     def forward(
         self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]

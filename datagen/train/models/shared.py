@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from datagen.train.hands.poses import poses_of_clouds
 from datagen.train.hands.reach import N_CODES, hand_reach, hands_of
-from datagen.train.inputs import ORDERS, CandidateInputs, Clouds, RobotInputs, in_random_order
+from datagen.train.inputs import CandidateInputs, Clouds, RobotInputs
 from datagen.train.models.crop import crop_clouds, take_rows
 from datagen.train.models.frames import (
     N_PAIR_FEATURES,
@@ -177,47 +177,17 @@ class SharedModel(Model):
         """
         if isinstance(clouds, EncodedClouds):
             return unpack(clouds, token_sizes(len(self.sizes.scales_m)))
-        tokens = self._tokens(clouds, robots)
-        return (
-            replace(tokens, hand_poses=self._hand_poses(clouds, robots)) if self.sizes.hand_poses else tokens
-        )
-
-    def _tokens(self, clouds: Clouds[Tensor], robots: RobotInputs[Tensor]) -> Tokens:
-        """The clouds' tokens, without hand poses."""
         with torch.no_grad(), torch.autocast(clouds.points_m.device.type, enabled=False):
             crop = crop_clouds(clouds, robots, self.sizes.n_points)
-            return tokens_of(crop, self.sizes.tokens, self.sizes.near_m, self.sizes.scales_m)
-
-    def _hand_poses(self, clouds: Clouds[Tensor], robots: RobotInputs[Tensor]) -> Tensor:
+            tokens = tokens_of(crop, self.sizes.tokens, self.sizes.near_m, self.sizes.scales_m)
+        if not self.sizes.hand_poses:
+            return tokens
         points, mask, count = (
             t.cpu().numpy() for t in (clouds.points_m, clouds.target_mask, clouds.n_points)
         )
         hands = hands_of(on_cpu(robots), len(clouds)) if self.sizes.kinematics else ()
         poses = torch.from_numpy(poses_of_clouds(points, mask, count, self.sizes.hand_poses, hands))
-        return poses.to(clouds.points_m.device)
-
-    def chance(
-        self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
-    ) -> Tensor:
-        """Probabilities (N,), means over tokens of the clouds in `ORDERS` random orders; 0 out of reach.
-
-        Tokens are a small sample of a cloud: of one sample alone scores are worse (explanation/models.md).
-        """
-        if not len(candidates) or isinstance(clouds, EncodedClouds):
-            return super().chance(clouds, candidates, robots)
-        made = [self._tokens(in_random_order(clouds, k), robots) for k in range(ORDERS)]
-        if self.sizes.hand_poses:
-            poses = self._hand_poses(clouds, robots)
-            made = [replace(tokens, hand_poses=poses) for tokens in made]
-        first = made[0], clouds, candidates, robots
-        rho = self.visible_share(*first) if self.sizes.observed_visibility else candidates.base_xy_m[:, 0]
-        reach = self.hand_reach(*first)
-        given = EncodedCandidates(
-            candidates.robot_row, candidates.base_xy_m, rho, reach=reach, turn_rad=candidates.turn_rad
-        )
-        logits = torch.stack([self.score_tokens(tokens, clouds, given, robots) for tokens in made])
-        chance = torch.softmax(logits.double(), dim=2)[..., 1].mean(0)
-        return chance if reach is None else torch.where((reach > 0).flatten(1).any(1), chance, 0.0)
+        return replace(tokens, hand_poses=poses.to(clouds.points_m.device))
 
     def score_tokens(
         self,

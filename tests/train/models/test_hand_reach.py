@@ -122,19 +122,6 @@ def test_the_arm_the_hand_and_the_heading_change_logits(model: Model) -> None:
 
 
 @needs_sim
-@torch.no_grad()
-def test_a_base_from_which_no_pose_is_reached_has_no_chance(model: Model) -> None:
-    clouds, candidates, robots = drawn_tables(3)
-    far = replace(candidates, base_xy_m=candidates.base_xy_m + torch.tensor([4.0, 0.0]))
-    assert float(model.chance(clouds, candidates, robots).amax()) > 0.0
-    assert (
-        float(model.chance(clouds, far, robots).amax())
-        == 0.0
-        < float(model.score(clouds, far, robots).amax())
-    )
-
-
-@needs_sim
 @pytest.mark.parametrize("angle", [0.3, -2.0, 4.0])
 def test_codes_turn_with_the_scene_and_a_far_base_has_none(angle: float) -> None:
     clouds, candidates, robots = tables = drawn_tables(7, candidates=60)

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from datagen.train.inputs import ORDERS, in_random_order
 from datagen.train.models import Model
 from datagen.train.models.frames import frames_of, pair_features
 from datagen.train.models.hand_pooling import tiles
@@ -48,25 +47,6 @@ def test_rotating_the_candidates_alone_changes_logits(model: Model):
     _, elsewhere, _ = turned_about_z((clouds, candidates, robots), 1.0)
     change = model.score(clouds, elsewhere, robots) - model.score(clouds, candidates, robots)
     assert float(change.abs().amax()) > 1e-3
-
-
-@torch.no_grad()
-def test_the_chance_is_a_mean_over_random_orders_of_the_points(model: Model):
-    clouds, candidates, robots = drawn_tables(1)
-    orders = [
-        torch.softmax(model.score(in_random_order(clouds, k), candidates, robots).double(), dim=1)[:, 1]
-        for k in range(ORDERS)
-    ]
-    mean = model.chance(clouds, candidates, robots)
-    torch.testing.assert_close(mean, torch.stack(orders).mean(0))
-    assert float((mean - orders[0]).abs().amax()) > 1e-3
-    # Each order has all valid points, and padding stays at the end.
-    short = replace(clouds, n_points=torch.tensor([50, 96]))
-    shuffled = in_random_order(short, 1)
-    for row, n in enumerate((50, 96)):
-        for before, after in ((short.points_m, shuffled.points_m), (short.rgb, shuffled.rgb)):
-            assert sorted(before[row, :n].tolist()) == sorted(after[row, :n].tolist())
-            assert torch.equal(before[row, n:], after[row, n:])
 
 
 @settings(max_examples=50, deadline=None)
