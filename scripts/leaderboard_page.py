@@ -112,21 +112,18 @@ def _percent(value: float | None) -> float | None:
     return None if value is None else round(100 * value, 1)
 
 
-def _entries(folder: Path, scored: Benchmark) -> tuple[dict[str, Any], list[str]]:
-    """The entries of a folder by name, and the names, best first."""
+def _entries(folder: Path, scored: Benchmark, part: str) -> tuple[dict[str, Any], list[str]]:
+    """The entries of a folder by name, and the names, those with the best picks in a part first."""
     entries = {path.stem: json.loads(path.read_text("utf-8")) for path in sorted(folder.glob("*.json"))}
     assert all(entry["benchmark"] == scored.digest() for entry in entries.values()), "of another version"
-    best = {
-        n: (e["grids"].get("grids, decisive") or e["grids"]["grids"])["good"][0] for n, e in entries.items()
-    }
-    return entries, sorted(entries, key=lambda name: -best[name])
+    return entries, sorted(entries, key=lambda name: -entries[name]["grids"][part]["good"][0])
 
 
 def page() -> str:
     """The page."""
     (folder, ours), (of_pack, pack) = boards().items()
-    entries, order = _entries(folder, ours)
-    packed, packed_order = _entries(of_pack, pack)
+    entries, order = _entries(folder, ours, "grids, decisive")
+    packed, packed_order = _entries(of_pack, pack, "grids")
     known = packed | entries
     decisive, feasible = (
         {n: e["grids"][t] for n, e in entries.items()} for t in ("grids, decisive", "grids")
