@@ -18,9 +18,9 @@ _DPI = 120
 _LINE_IN, _TEXT_POINTS = 0.19, 68  # of facts: height of a line, and where texts begin
 
 
-def new_sheet(title: str, height_in: float) -> Figure:
-    """An empty figure of the common width with automatic layout."""
-    figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=_DPI, layout="constrained")
+def new_sheet(title: str, height_in: float, width_in: float = _WIDTH_IN) -> Figure:
+    """An empty figure, by default of the common width, with automatic layout."""
+    figure = Figure(figsize=(width_in, height_in), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=13)
     return figure

@@ -40,10 +40,17 @@ def test_the_site_is_whole_and_fetches_nothing(tmp_path: Path) -> None:
     for page in tmp_path.rglob("*.html"):
         text = page.read_text("utf-8")
         assert not script.findall(text) + style.findall(text), page
+        assert "```" not in text, f"{page}: a block of code is shown as text"
 
     # References come from the program.
     commands = (tmp_path / "reference" / "command-line.html").read_text("utf-8")
     assert all(f'id="datagen-{verb}"' in commands for verb in VERBS)
+    assert "datagen benchmark make --houses" in commands and "mkdocs --" not in commands
     python = (tmp_path / "reference" / "python.html").read_text("utf-8")
     named = re.findall(r"^::: (\S+)$", (DOCS / "reference" / "python.md").read_text("utf-8"), re.MULTILINE)
     assert named and all(f'id="{name}"' in python for name in named)
+
+
+def test_the_table_of_verbs_is_whole() -> None:
+    table = (DOCS / "reference" / "command-line.md").read_text("utf-8").partition("\n## ")[0]
+    assert [verb for verb in VERBS if f"`{verb}" not in table] == []

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from html import escape
+from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -10,16 +12,22 @@ import plotly.graph_objects as go
 from plotly.colors import get_colorscale
 from plotly.io import to_html
 
+from datagen.display.figures import new_sheet, save_sheet
 from datagen.display.styles import BEST, SCORE_COLOURS, TARGET
 from datagen.schemas.errors import printable
 from datagen.train.inputs import F64
 from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import STATES
-from datagen.train.prediction.pictures import shown_rows
+from datagen.train.prediction.pictures import draw_plan, draw_view, shown_rows
 from datagen.train.prediction.prediction_report import report_rows
 
 _MOST_POINTS = 20_000
-_SYMBOLS = {"clear": "square", "blocked": "x", "unseen": "square-open", "unreachable": "diamond-open"}
+_SYMBOLS = {
+    "clear": "square",
+    "blocked": "circle-open",
+    "unseen": "square-open",
+    "unreachable": "diamond-open",
+}
 _TARGET_RGB = tuple(int(TARGET.colour[k : k + 2], 16) for k in (1, 3, 5))
 _CAPTION = (
     "The cloud with the target in pink, and the grid of base poses, from red (score 0) to blue (1). Drag "
@@ -36,6 +44,7 @@ body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); background: var(
 h1 { font-size: 1.6rem; line-height: 1.25; overflow-wrap: anywhere; }
 figure { margin: .6rem 0 1.2rem; padding: .4rem; background: #ffffff; color: #1b1f24;
   border: 1px solid var(--pale); border-radius: 6px; overflow-x: auto; }
+figure img { max-width: 100%; vertical-align: top; }
 figcaption { font-size: .92rem; color: #59636e; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1rem; margin: .6rem 0; }
 dt { color: var(--pale); }
@@ -55,7 +64,7 @@ def page_of(prediction: Prediction) -> str:
         paper_bgcolor="#ffffff",
         scene={
             "aspectmode": "data",
-            "camera": {"eye": {"x": eye[0], "y": eye[1], "z": 1.15}, "center": {"x": 0, "y": 0, "z": -0.12}},
+            "camera": {"eye": {"x": eye[0], "y": eye[1], "z": 1.15}, "center": {"x": 0, "y": 0, "z": -0.2}},
             **{f"{axis}axis": {"title": f"{axis} [m]", "nticks": 5} for axis in "xyz"},
         },
         legend={"orientation": "h", "x": 0, "y": 0, "yanchor": "top", "itemsizing": "constant"},
@@ -65,7 +74,7 @@ def page_of(prediction: Prediction) -> str:
     view = to_html(
         {"data": [{**trace, "type": "scatter3d"} for trace in traces], "layout": layout.to_plotly_json()},
         validate=False, include_plotlyjs=True,
-        full_html=False, div_id="prediction", default_height="min(40rem, 120vw)",
+        full_html=False, div_id="prediction", default_height="min(40rem, 112vw)",
         config={"responsive": True, "displaylogo": False},
     )  # fmt: skip
     title = escaped(f"Base poses scored by {prediction.scorer}")
@@ -75,7 +84,8 @@ def page_of(prediction: Prediction) -> str:
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>{_STYLE}</style></head>\n<body>\n<h1>{title}</h1>\n<dl>{facts}</dl>\n"
+        f"<title>{title}</title><style>{_STYLE}</style></head>\n<body>\n<h1>{title}</h1>\n"
+        f"<figure>{_views(prediction)}</figure>\n<dl>{facts}</dl>\n"
         f'<figure tabindex="0">{view}<figcaption>{escaped(_CAPTION)}</figcaption></figure>\n</body></html>\n'
     )
 
@@ -83,6 +93,18 @@ def page_of(prediction: Prediction) -> str:
 def escaped(text: str) -> str:
     """The text escaped for HTML, without markup or control characters."""
     return escape(printable(text))
+
+
+def _views(prediction: Prediction) -> str:
+    text = ""
+    for draw, height_in in ((draw_view, 4.0), (draw_plan, 5.2)):
+        figure, drawn = new_sheet("", height_in, 5.0), BytesIO()  # 5 inches: readable text on a phone
+        draw(axes := figure.subplots(), prediction)
+        if axes.has_data():  # clouds from files have no image
+            save_sheet(figure, drawn)
+            png = b64encode(drawn.getvalue()).decode()
+            text += f'<img alt="{axes.get_title()}" src="data:image/png;base64,{png}">'
+    return text
 
 
 def _cloud(prediction: Prediction) -> dict[str, Any]:
@@ -100,14 +122,10 @@ def _base_poses(prediction: Prediction) -> list[dict[str, Any]]:
         rows = prediction.rows(state)
         if not len(rows):
             continue
-        xy, scores, yaw_deg = (
-            prediction.base_xy_m[rows],
-            prediction.score[rows],
-            np.degrees(prediction.yaw_rad),
-        )
+        xy, scores = prediction.base_xy_m[rows], prediction.score[rows]
         texts = [
             f"{state}<br>score {s:.3f}<br>x {x:.3f} m, y {y:.3f} m<br>yaw {w:.1f} deg"
-            for s, (x, y), w in zip(scores, xy, yaw_deg[rows], strict=True)
+            for s, (x, y), w in zip(scores, xy, np.degrees(prediction.yaw_rad[rows]), strict=True)
         ]
         marker = {
             **{"size": 3 if state in ("blocked", "unreachable") else 6, "symbol": _SYMBOLS[state]},
@@ -127,12 +145,13 @@ def _best(prediction: Prediction) -> list[dict[str, Any]]:
     robot, xy, yaw = prediction.robot, prediction.base_xy_m[row], float(prediction.yaw_rad[row])
     ring = robot.outline.outline(xy, yaw)
     ring, tip = np.concatenate([ring, ring[:1]]), xy + 0.35 * np.array([np.cos(yaw), np.sin(yaw)])
-    top_m = max(robot.camera_height_m, robot.base_height_m)
-    lines = [(ring, (0.01,) * len(ring)), (ring, (robot.base_height_m,) * len(ring))]
-    lines += [(np.array([xy, xy]), (0.01, top_m)), (np.array([xy, tip]), (robot.base_height_m,) * 2)]
+    wings = [tip + 0.12 * np.array([np.cos(yaw + turn), np.sin(yaw + turn)]) for turn in (2.6, -2.6)]
+    arrow = np.array([xy, tip, wings[0], tip, wings[1]])
+    lines = [(line, (z,) * len(line)) for z in (0.01, robot.base_height_m) for line in (ring, arrow)]
+    lines += [(np.array([xy, xy]), (0.01, max(robot.camera_height_m, robot.base_height_m)))]
     gap = np.full((1, 3), np.nan)  # ends a line
     path = np.concatenate([part for line, z in lines for part in (np.column_stack([line, z]), gap)])
-    look = {"mode": "lines", "line": {"color": BEST.colour, "width": 8}, "connectgaps": False}
+    look = {"mode": "lines", "line": {"color": BEST.colour, "width": 6}, "connectgaps": False}
     name = f"best, score {prediction.score[row]:.3f}"
     return [_at(path) | look | {"name": name, "hoverinfo": "name"}]
 

@@ -16,10 +16,9 @@ from matplotlib.patches import Patch, Polygon
 
 from datagen.display.figures import draw_frame, new_sheet, save_sheet, write_facts
 from datagen.display.styles import BEST, CAMERA, SCORE_COLOURS, TARGET
-from datagen.train.inputs import F64, I64
+from datagen.train.inputs import I64
 from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import BLOCKED, CLEAR, STATES, UNREACHABLE, UNSEEN
-from datagen.train.prediction.frames import RgbdImage
 from datagen.train.prediction.prediction_report import report_rows
 
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
@@ -44,30 +43,29 @@ def draw_prediction(prediction: Prediction, out: IO[bytes], ending: str = ".png"
     figure = new_sheet(title, 7.0)
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(1, 1.15))).tolist()
     frame, facts = left.subplots(2, 1, height_ratios=(1, 1.05))
-    frame.set_axis_off()
-    shown = zip(prediction.frames, prediction.grounds, strict=True)
-    seen = [(f.image, ground) for f, ground in shown if f.image is not None and f.image.mask is not None]
-    if seen:
-        image, ground = seen[0]
-        draw_frame(frame, image.rgb, image.mask, "target outlined, base on the floor")
-        _draw_base(frame, prediction, image, ground.T_world_camera)
+    draw_view(frame, prediction)
     write_facts(facts, report_rows(prediction))
-    plan = right.subplots()
-    scale = ScalarMappable(Normalize(0, 1), SCORE_COLOURS)
-    right.colorbar(scale, ax=plan, shrink=0.75, label="score (0 bad, 1 good)")
-    _draw_plan(plan, prediction, scale)
+    draw_plan(right.subplots(), prediction)
     save_sheet(figure, out, ending)
 
 
-def _draw_base(axes: Axes, prediction: Prediction, image: RgbdImage, T_world_camera: F64) -> None:
-    """Draw the best base and its heading on the floor of the picture, where they are in view."""
+def draw_view(axes: Axes, prediction: Prediction) -> None:
+    """Draw the first image with a mask: its target, and the best base and its heading on the floor."""
+    axes.set_axis_off()
+    shown = zip(prediction.frames, prediction.grounds, strict=True)
+    seen = [(f.image, ground) for f, ground in shown if f.image is not None and f.image.mask is not None]
+    if not seen:
+        return
+    image, T_world_camera = seen[0][0], seen[0][1].T_world_camera
+    draw_frame(axes, image.rgb, image.mask, "target outlined, base on the floor")
     if prediction.best is None:
         return
     xy, yaw = prediction.base_xy_m[prediction.best], float(prediction.yaw_rad[prediction.best])
     corners = prediction.robot.outline.outline(xy, yaw)
     ahead = np.linspace(xy, xy + 0.38 * np.array([np.cos(yaw), np.sin(yaw)]), 20)
     height, width = image.depth_m.shape
-    for line in (_dense(np.concatenate([corners, corners[:1]])), ahead):
+    ring = [np.linspace(a, b, 24) for a, b in pairwise([*corners, corners[0]])]
+    for line in (np.concatenate(ring), ahead):
         points = (np.insert(line, 2, 0.0, axis=1) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
         u, v = image.pinhole.pixels(points).T
         u[points[:, 2] < _NEAREST_M] = np.nan  # ends the line
@@ -83,12 +81,6 @@ def _draw_base(axes: Axes, prediction: Prediction, image: RgbdImage, T_world_cam
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
 
 
-def _dense(line_m: F64) -> F64:
-    """Points (M, 2) along a line of corners (N, 2)."""
-    parts = [np.linspace(a, b, 24) for a, b in pairwise(line_m)]
-    return np.concatenate(parts)
-
-
 def shown_rows(prediction: Prediction, most: int, around_m: float) -> I64:
     """Rows of points to draw: a bounded number near the target, without those overhead."""
     points = prediction.seen.points_m
@@ -98,19 +90,22 @@ def shown_rows(prediction: Prediction, most: int, around_m: float) -> I64:
     return rows if len(rows) <= most else np.random.default_rng(0).choice(rows, most, replace=False)
 
 
-def _draw_plan(axes: Axes, prediction: Prediction, scale: ScalarMappable) -> None:
+def draw_plan(axes: Axes, prediction: Prediction) -> None:
+    """Draw the grid from above on the map: scores, target and best base; its legend below."""
+    scale = ScalarMappable(Normalize(0, 1), SCORE_COLOURS)
+    axes.figure.colorbar(scale, ax=axes, shrink=0.75, fraction=0.06, label="score (0 bad, 1 good)")
     offset_m, centre = prediction.cells.offset_m, prediction.center_m
     half_m, side_m = float(np.abs(offset_m).max()) + 0.35, float(np.diff(np.unique(offset_m[:, 0])[:2])[0])
     legend: list[Any] = []
     if prediction.known is not None:
         known = prediction.known.points(centre[:2] - half_m, centre[:2] + half_m)
         for xy, (words, colour) in zip(known, _MAP_COLOURS, strict=True):
-            axes.scatter(*xy.T, s=4, c=colour, lw=0, marker="s", zorder=0)
+            axes.scatter(*xy.T, s=4, c=colour, lw=0, marker="s", zorder=0, rasterized=True)
             legend.append(Patch(fc=colour, ec="#999999", label=words))
     rows = shown_rows(prediction, _MOST_POINTS, half_m)
     rows = rows[np.argsort(prediction.seen.points_m[rows, 2])]  # higher points hide lower ones
     x, y, _ = prediction.seen.points_m[rows].T
-    axes.scatter(x, y, c=prediction.seen.rgb[rows] / 255, s=2.5, lw=0, zorder=1)
+    axes.scatter(x, y, c=prediction.seen.rgb[rows] / 255, s=2.5, lw=0, zorder=1, rasterized=True)
     for state in STATES:
         rows, (corners, alpha, edge) = prediction.rows(state), _LOOK[state]
         if len(rows):
@@ -118,7 +113,8 @@ def _draw_plan(axes: Axes, prediction: Prediction, scale: ScalarMappable) -> Non
             faces = scale.to_rgba(prediction.score[rows], alpha=alpha)
             look: dict[str, Any] = {"facecolors": faces, "edgecolors": edge, "linewidths": 0.9, "zorder": 3}
             axes.add_collection(PolyCollection(list(cells), **look))
-            marker: dict[str, Any] = {"marker": corners, "ms": 14 * np.ptp(corners), "mec": edge}
+            closed = np.concatenate([corners, corners[:1]])
+            marker: dict[str, Any] = {"marker": closed, "ms": 14 * np.ptp(corners), "mec": edge}
             face = scale.to_rgba(np.array([0.8]), alpha=alpha)[0]
             legend.append(Line2D([], [], ls="", mfc=face, label=f"{len(rows)} {state}", **marker))
     x, y, _ = prediction.seen.points_m[prediction.seen.on_target].T
@@ -126,7 +122,9 @@ def _draw_plan(axes: Axes, prediction: Prediction, scale: ScalarMappable) -> Non
     eyes = np.array([ground.T_world_camera[:2, 3] for ground in prediction.grounds])
     camera: dict[str, Any] = {"ls": "", "marker": np.array(CAMERA.marker), "ms": 11, "mec": CAMERA.edge}
     legend.append(Patch(fc=TARGET.colour, label=TARGET.words))
-    legend += axes.plot(*eyes.T, color=CAMERA.colour, label=CAMERA.words, zorder=6, **camera)
+    eyes = eyes[(np.abs(eyes - centre[:2]) < half_m).all(axis=1)]
+    if len(eyes):
+        legend += axes.plot(*eyes.T, color=CAMERA.colour, label=CAMERA.words, zorder=6, **camera)
     gold: dict[str, Any] = {"ls": "", "marker": "o", "ms": 9, "color": BEST.colour, "mec": "black"}
     if prediction.best is not None:
         xy, yaw = prediction.base_xy_m[prediction.best], prediction.yaw_rad[prediction.best]
@@ -143,4 +141,4 @@ def _draw_plan(axes: Axes, prediction: Prediction, scale: ScalarMappable) -> Non
     axes.set(xlim=(centre[0] - half_m, centre[0] + half_m), ylim=(centre[1] - half_m, centre[1] + half_m))
     axes.set_aspect("equal")
     axes.set(xlabel="x [m]", ylabel="y [m]", title="from above")
-    axes.legend(handles=legend, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
+    axes.figure.legend(handles=legend, loc="outside lower center", ncols=3, frameon=False)

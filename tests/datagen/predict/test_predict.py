@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ import safetensors.torch
 import torch
 from PIL import Image
 
+import datagen
 import datagen.workers.robots
-from datagen import cli
+from datagen import cli, released
 from tests.datagen.predict.frames import arguments, frame_with
 from tests.refusals import refused
 from tests.sim_extra import needs_robots
@@ -45,8 +47,23 @@ def test_an_answer_as_json_picture_and_page(
     # The view begins behind the camera, which is at y = 0 and looks ahead along y.
     eye = re.search(r'"eye":\{"x":([-.\d]+),"y":([-.\d]+)', text)
     assert eye is not None and abs(float(eye[1])) < 0.5 and float(eye[2]) < -2
+    assert text.count('" src="data:image/png;base64,') == 2  # the camera's image and the plan
+    # The view draws symbols as text: a font without such a character as that of "x" shows a box.
+    shapes = {"square", "square-open", "circle-open", "diamond-open"}
+    assert set(re.findall(r'"symbol":"([\w-]+)"', text)) <= shapes
     assert "Plotly.newPlot" in text and "score 0." in text and 'src="http' not in text
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.html", "a.png"]
+
+
+def test_the_drawing_of_the_sample_lists_what_it_shows(tmp_path: Path) -> None:
+    frame, out = released.sample_frame(), tmp_path / "a.svg"
+    sizes: dict[str, Any] = {"base_height": 0.7, "reach": 0.9}
+    answer = datagen.predict(frame=[frame], map=[frame / released.MAP], out=out, **sizes)
+    text = out.read_text()
+    assert "<!-- occupied -->" in text and "<!-- target -->" in text
+    x, y = answer.seen.eyes_m[0, :2] - answer.center_m[:2]
+    assert max(abs(x), abs(y)) > 1.35 and "<!-- camera -->" not in text  # it stands outside
+    assert len(text) < 1e6  # map and cloud are images: squares of a map had gaps between them
 
 
 def test_a_click_and_the_same_frame_as_folder_archive_and_cloud(
