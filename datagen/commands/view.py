@@ -43,7 +43,7 @@ def view(
         out: File to write, FILE.rrd, in place of opening the viewer.
     """
     refuse_missing("rerun")
-    from datagen.exports.rerun_recording import joined, recording
+    from datagen.exports.rerun_recording import joined, layout, recording
 
     if out is not None:
         refuse_output(out, "--out", ".rrd")
@@ -72,5 +72,6 @@ def view(
     print_rows(f"scenes of {run}", [(str(k), str(rows.record["object_name"][0])) for k, _, rows in scenes])
     with tempfile.TemporaryDirectory() as folder:
         file = out or Path(folder) / "scenes.rrd"
-        file.write_bytes(joined([recording(source, of, rows).data for _, of, rows in scenes]))
+        shown = [recording(source, of, rows).data for _, of, rows in scenes]
+        file.write_bytes(joined([*shown, layout("attempts" in codes)]))
         return 0 if out else min(subprocess.call([sys.executable, "-m", "rerun", str(file)]), 1)

@@ -16,22 +16,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 import rerun as rr
+import rerun.blueprint as rrb
+from matplotlib import color_sequences
 from rerun.chunk import Chunk, ChunkStore
 
 from datagen.drawing.posed_robot import robot_bodies
 from datagen.drawing.scene_picture import best_success
 from datagen.exports.export_run import ExportSource, NewFile, Step, scene_key
 from datagen.exports.glb import LABEL_RGB, arrows
-from datagen.schemas.fields import SceneRows
+from datagen.schemas.fields import SceneRows, facing_rad
 from datagen.schemas.run import Run
 from datagen.workers.geometry.mesh import F64, Mesh, concatenate
+from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_candidates
 
 if TYPE_CHECKING:
     from datagen.drawing.trial_picture import Retrial
 
 _POINT_M, _BASE_M = 0.005, 0.04
-_SEE_THROUGH = (255, 255, 255, 40)  # of walls
+_OUTSIDE, _SEE_THROUGH = ("Wall", "Door"), (255, 255, 255, 40)
+# Of the viewer, in the frame of the entity "focus": the target's centre, x level towards the camera.
+_EYE_M = (1.6, -0.4, 0.9)
 _ABOUT = "__properties"  # where Rerun keeps what it says of a recording
 # Of a file of Rerun: bytes before the first message, and kinds of messages.
 _HEADER_BYTES, _END, _STORE = 12, 0, 1
@@ -54,10 +59,23 @@ def recording(source: ExportSource, run: Run, rows: SceneRows) -> NewFile:
 
 
 def joined(recordings: Sequence[bytes]) -> bytes:
-    """One file of recordings as `recording` makes them: their messages, with one header and one end."""
+    """The messages of files that `recording` and `layout` make, with one header and one end."""
     end = struct.pack("<QQ", _END, 0)
     messages = (data[_HEADER_BYTES:].removesuffix(end) for data in recordings)
     return b"".join([recordings[0][:_HEADER_BYTES], *messages, end])
+
+
+def layout(has_trials: bool) -> bytes:
+    """A file that has the viewer begin near the target, with curves of joints where there are trials."""
+    eye = rrb.EyeControls3D(position=_EYE_M, look_target=(0.0, 0.0, 0.0))
+    view = rrb.Spatial3DView(name="scene", origin="focus", contents="/**", eye_controls=eye)
+    curves = [rrb.TimeSeriesView(name="joints, rad or m", origin="joints")] if has_trials else []
+    shown = rrb.Vertical(view, *curves, row_shares=[3, 1][: 1 + len(curves)])
+    panels = [panel(state="collapsed") for panel in (rrb.SelectionPanel, rrb.TimePanel)]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "layout.rbl"
+        rrb.Blueprint(shown, *panels).save("datagen", str(path))
+        return _repeatable(path.read_bytes())
 
 
 def _chunks(run: Run, rows: SceneRows, scene: ReconstructedScene) -> Iterator[Chunk]:
@@ -67,7 +85,7 @@ def _chunks(run: Run, rows: SceneRows, scene: ReconstructedScene) -> Iterator[Ch
     yield _static(_ABOUT, rr.archetypes.RecordingInfo, name=[f"scene {scene.index}: {scene.models[0].name}"])
     bodies = scene.house.house.bodies
     for path, are_walls, more in (("house", False, {}), ("walls", True, {"albedo_factor": [_SEE_THROUGH]})):
-        if meshes := [body.visual for body in bodies if (body.object_type == "Wall") == are_walls]:
+        if meshes := [body.visual for body in bodies if (body.object_type in _OUTSIDE) == are_walls]:
             yield _mesh(path, concatenate(meshes), **more)
     for k, (model, T) in enumerate(zip(scene.models, scene.T_world_object, strict=True)):
         yield _mesh(f"objects/{k}", model.visual)
@@ -77,6 +95,8 @@ def _chunks(run: Run, rows: SceneRows, scene: ReconstructedScene) -> Iterator[Ch
     radii = np.full(n, _POINT_M)
     yield _static("cloud", rr.Points3D, positions=cloud_m, colors=record["rgb"][:n], radii=radii)
     yield _pose("camera", camera.T_world_camera)
+    towards_m = camera.T_world_camera[:2, 3] - scene.target_center_m[:2]
+    yield _pose("focus", yaw_pose(*scene.target_center_m, float(facing_rad(towards_m))))
     K = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
     size = [[camera.width_px, camera.height_px]]
     yield _static("camera", rr.Pinhole, image_from_camera=[K], resolution=size)
@@ -111,6 +131,8 @@ def _moving(run: Run, again: Retrial) -> Iterator[Chunk]:
     for name, T in (("robot", T_robot), ("objects", recording.T_world_object)):
         for k in range(T.shape[1]):
             yield _pose(f"{name}/{k}", T[:, k], recording.time_s)
+    colors = np.array(color_sequences["tab10"])[: len(robot.joint_names)]
+    yield _static("joints", rr.SeriesLines, names=robot.joint_names, colors=colors)
     joints = rr.Scalars.columns(scalars=recording.q_rad)
     yield Chunk.from_columns("joints", [rr.TimeColumn("trial", duration=recording.time_s)], joints)
 

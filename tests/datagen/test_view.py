@@ -44,8 +44,11 @@ def test_the_chosen_scenes_are_in_one_file(
         assert cli.run([*words, *more]) == 0
         assert [int(line.split()[0]) for line in capsys.readouterr().out.splitlines()[1:]] == wanted
         reader = RrdReader(str(out))
-        assert len(stores := reader.recordings()) == len(wanted)
-        assert all("/cloud" in {c.entity_path for c in reader.stream(store=store)} for store in stores)
+        stores = reader.recordings()
+        assert len(stores) == len(wanted)
+        for store in stores:
+            assert {"/cloud", "/focus"} <= {c.entity_path for c in reader.stream(store=store)}
+        assert len(reader.blueprints()) == 1  # the viewer begins near the target
     refused([*words, "--place", "roof"], capsys, "--place: roof", "Choose one of: floor, inside")
     refused([*words, "--disagreement", "heuristic"], capsys, "--disagreement: heuristic", "beside its own")
     refused([*words, "--outcome", "success"], capsys, "--outcome: success", "the run has none")
