@@ -63,7 +63,7 @@ def serve(given: ServeOptions) -> None:
     """Answer requests for base poses: a frame in, an answer out; frames of a session are fused.
 
     POST /base takes an .npz with rgb, depth, intrinsics and optionally mask and T_world_camera as its body,
-    and click or box, session, arrival, allow_unseen, camera_height, candidates as its query (/openapi.json).
+    and click or box, session, arrival, allow_unseen, camera_height, candidates as its query. /docs lists all.
 
     For example: datagen serve --robot fetch --map map.yaml
     """
@@ -72,7 +72,7 @@ def serve(given: ServeOptions) -> None:
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # of the worker processes
     app = app_of(given)
     with Progress() as shown:
-        shown.phase(f"listening on http://{given.host}:{given.port}, described at /openapi.json")
+        shown.phase(f"listening on http://{given.host}:{given.port}, described at /docs")
         uvicorn.run(app, host=given.host, port=given.port, log_level="warning", limit_concurrency=64)
 
 

@@ -96,7 +96,8 @@ def _chunks(run: Run, rows: SceneRows, scene: ReconstructedScene) -> Iterator[Ch
     yield _static("cloud", rr.Points3D, positions=cloud_m, colors=record["rgb"][:n], radii=radii)
     yield _pose("camera", camera.T_world_camera)
     towards_m = camera.T_world_camera[:2, 3] - scene.target_center_m[:2]
-    yield _pose("focus", yaw_pose(*scene.target_center_m, float(facing_rad(towards_m))))
+    x_m, y_m, z_m = scene.target_center_m.tolist()
+    yield _pose("focus", yaw_pose(x_m, y_m, z_m, float(facing_rad(towards_m))))
     K = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
     size = [[camera.width_px, camera.height_px]]
     yield _static("camera", rr.Pinhole, image_from_camera=[K], resolution=size)

@@ -74,9 +74,7 @@ def make_app(workers: WorkerProcesses, model: str, token: str | None) -> FastAPI
             raise HTTPException(401, "give the token: Authorization: Bearer WORD")
 
     rules = [Depends(allowed)]
-    # FastAPI's own pages fetch their scripts from the internet, and are blank without it.
-    app = FastAPI(title="datagen", version=__version__, dependencies=rules, lifespan=lambda _: workers,
-                  docs_url=None, redoc_url=None)  # fmt: skip
+    app = FastAPI(title="datagen", version=__version__, dependencies=rules, lifespan=lambda _: workers)
 
     @app.get("/health")
     async def health() -> dict[str, Any]:  # pyright: ignore[reportUnusedFunction]
