@@ -34,8 +34,9 @@ if TYPE_CHECKING:
     from datagen.drawing.trial_picture import Retrial
 
 _POINT_M, _BASE_M = 0.005, 0.04
-_OUTSIDE, _SEE_THROUGH = ("Wall", "Door"), (255, 255, 255, 40)
-# Of the viewer, in the frame of the entity "focus": the target's centre, x level towards the camera.
+_ROOM_TYPES, _SEE_THROUGH = ("Wall", "Door"), (255, 255, 255, 40)
+# Where the viewer stands, in the frame of the entity "focus": origin at the target's centre, x level
+# towards the camera, z up.
 _EYE_M = (1.6, -0.4, 0.9)
 _ABOUT = "__properties"  # where Rerun keeps what it says of a recording
 # Of a file of Rerun: bytes before the first message, and kinds of messages.
@@ -66,7 +67,10 @@ def joined(recordings: Sequence[bytes]) -> bytes:
 
 
 def layout(has_trials: bool) -> bytes:
-    """A file that has the viewer begin near the target, with curves of joints where there are trials."""
+    """A file of Rerun that has the viewer begin near the target, with curves of joints if `has_trials`.
+
+    Its identifiers differ each time, so exports, which repeat their bytes, have none.
+    """
     eye = rrb.EyeControls3D(position=_EYE_M, look_target=(0.0, 0.0, 0.0))
     view = rrb.Spatial3DView(name="scene", origin="focus", contents="/**", eye_controls=eye)
     curves = [rrb.TimeSeriesView(name="joints, rad or m", origin="joints")] if has_trials else []
@@ -85,7 +89,7 @@ def _chunks(run: Run, rows: SceneRows, scene: ReconstructedScene) -> Iterator[Ch
     yield _static(_ABOUT, rr.archetypes.RecordingInfo, name=[f"scene {scene.index}: {scene.models[0].name}"])
     bodies = scene.house.house.bodies
     for path, are_walls, more in (("house", False, {}), ("walls", True, {"albedo_factor": [_SEE_THROUGH]})):
-        if meshes := [body.visual for body in bodies if (body.object_type in _OUTSIDE) == are_walls]:
+        if meshes := [body.visual for body in bodies if (body.object_type in _ROOM_TYPES) == are_walls]:
             yield _mesh(path, concatenate(meshes), **more)
     for k, (model, T) in enumerate(zip(scene.models, scene.T_world_object, strict=True)):
         yield _mesh(f"objects/{k}", model.visual)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from datagen import cli
@@ -46,8 +47,12 @@ def test_the_chosen_scenes_are_in_one_file(
         reader = RrdReader(str(out))
         stores = reader.recordings()
         assert len(stores) == len(wanted)
-        for store in stores:
-            assert {"/cloud", "/focus"} <= {c.entity_path for c in reader.stream(store=store)}
+        for k, store in zip(wanted, stores, strict=True):
+            batches = {c.entity_path: c.to_record_batch() for c in reader.stream(store=store)}
+            assert "/cloud" in batches
+            centre_m = read_scene(Run.open(finished), k).record["target_center_m"]
+            ((shown_m,),) = batches["/focus"]["Transform3D:translation"].to_pylist()
+            np.testing.assert_allclose(shown_m, centre_m, atol=1e-5)
         assert len(reader.blueprints()) == 1  # the viewer begins near the target
     refused([*words, "--place", "roof"], capsys, "--place: roof", "Choose one of: floor, inside")
     refused([*words, "--disagreement", "heuristic"], capsys, "--disagreement: heuristic", "beside its own")
