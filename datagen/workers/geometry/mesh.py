@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,14 @@ class Texture:
 
 
 @dataclass(frozen=True, eq=False)
+class MeshFile:
+    """The file that a mesh was read from; pictures read its textures again."""
+
+    path: Path
+    faces: I32  # (F,), of the mesh, as rows of the file's faces
+
+
+@dataclass(frozen=True, eq=False)
 class Mesh:
     """Triangles with a flat colour each and optionally a texture that overrides it."""
 
@@ -30,11 +39,12 @@ class Mesh:
     faces: I32  # (F, 3)
     face_rgb: U8  # (F, 3)
     texture: Texture | None = None
+    file: MeshFile | None = None
 
     def transformed(self, T_parent_mesh: F64) -> Mesh:
         """The mesh in the parent's frame; `T_parent_mesh` is (4, 4)."""
         vertices_m = self.vertices_m @ T_parent_mesh[:3, :3].T + T_parent_mesh[:3, 3]
-        return Mesh(vertices_m.astype(np.float32), self.faces, self.face_rgb, self.texture)
+        return Mesh(vertices_m.astype(np.float32), self.faces, self.face_rgb, self.texture, self.file)
 
 
 def face_normals(corners_m: F32) -> F32:

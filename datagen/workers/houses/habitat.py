@@ -25,7 +25,7 @@ from datagen.schemas.identity import digest_of
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.furniture.asset_geometry import type_of_name
 from datagen.workers.furniture.assets import CARRYING_TYPES
-from datagen.workers.geometry.mesh import F32, F64, Mesh
+from datagen.workers.geometry.mesh import F32, F64, Mesh, MeshFile
 from datagen.workers.geometry.transforms import rotation_of
 from datagen.workers.houses.glb import read_glb
 from datagen.workers.houses.habitat_checks import (
@@ -342,7 +342,8 @@ def _without_ceiling(stage: Mesh) -> Mesh:
     corner_z = stage.vertices_m[stage.faces][:, :, 2]
     near_top = corner_z.min(1) > max(1.8, float(stage.vertices_m[:, 2].max()) - 0.5)
     kept = ~((np.abs(normals[:, 2]) > 0.9) & near_top)
-    return Mesh(stage.vertices_m, stage.faces[kept], stage.face_rgb[kept])
+    file = None if stage.file is None else MeshFile(stage.file.path, stage.file.faces[kept])
+    return Mesh(stage.vertices_m, stage.faces[kept], stage.face_rgb[kept], file=file)
 
 
 def _surfaces(body: StaticBody, room_id: str, T: F64, local: Mesh) -> list[Surface]:

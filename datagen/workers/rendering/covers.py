@@ -1,16 +1,18 @@
-"""Patterns of the floors, walls and wood of a house in pictures, by the names of its materials."""
+"""What covers a house in pictures: patterns, by the names of materials, and textures of its meshes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from datagen.workers.furniture.asset_geometry import SHAPES
 from datagen.workers.furniture.solids import hash_bytes
-from datagen.workers.geometry.mesh import F32
+from datagen.workers.geometry.mesh import F32, I32, U8
+from datagen.workers.houses.glb import FaceTextures, read_textures
 from datagen.workers.houses.house import House, StaticBody
 
 I16 = npt.NDArray[np.int16]
@@ -25,15 +27,39 @@ _PATTERNS = {  # by the first of these words in the name of a material
 }
 _PLAIN = (*_GRAIN[:6], 0.0, 1.0, 0, 0)
 _WOODEN = {t for t, (_, palette) in SHAPES.items() if palette == SHAPES["Desk"][1]} - {"Painting"} | {"Door"}
+_BARE = FaceTextures((), np.full(1, -1, np.int32), np.zeros((1, 3, 2), np.float32))
 _RANDOM = np.random.default_rng(0).uniform(-1, 1, 256).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
+class HouseTextures:
+    """The images of a house's meshes, and where its faces lie on them."""
+
+    texels: U8  # (T, 3), rows of all images, one image after the other
+    images: I32  # (3, K): first texel, height and width
+    image: I32  # (F,), -1 without
+    uv: F32  # (6, F): u of the first corner, from it to the others; the same of v
+
+    def paint(self, rgb: U8, face: I32, barycentric: F32) -> None:
+        """Set the colours (N, 3) of points of faces (N,) that have a texture."""
+        image = self.image.take(face)
+        rows = np.flatnonzero(image >= 0)
+        first, height, width = self.images.take(image.take(rows), axis=1)
+        b, c = barycentric.take(rows, axis=0).T
+        u, u_b, u_c, v, v_b, v_c = self.uv.take(face.take(rows), axis=1)
+        u, v = u + b * u_b + c * u_c, v + b * v_b + c * v_c
+        column = np.minimum(((u - np.floor(u)) * width).astype(np.int32), width - 1)
+        row = np.minimum(((1 - v + np.floor(v)) * height).astype(np.int32), height - 1)
+        rgb[rows] = self.texels.take(first + row * width + column, axis=0)
+
+
+@dataclass(frozen=True, eq=False)
 class Cover:
-    """The patterns (10, K) of a house, the first plain, and those of its faces (F,)."""
+    """The patterns (10, K) of a house, the first plain, and those of its faces (F,); textures go before."""
 
     patterns: F32
     pattern: I16
+    textures: HouseTextures | None
 
     def shares(self, pattern: I16, points_m: F32, normals: F32, seen_m: F32) -> F32:
         """Shares (N,) of the colours at points (3, N) of patterns; pixels show `seen_m` (N,) of them."""
@@ -66,7 +92,34 @@ def house_cover(house: House) -> Cover:
         colours = [(r, g, b) for r, g, b in body.visual.face_rgb.tolist()]
         found = {rgb: _pattern(house, body, rgb) for rgb in set(colours)} if house.materials else {}
         rows += [known.setdefault(found.get(rgb, _PLAIN), len(known)) for rgb in colours]
-    return Cover(np.array(list(known), np.float32).T.copy(), np.array(rows, np.int16))
+    return Cover(np.array(list(known), np.float32).T.copy(), np.array(rows, np.int16), _textures(house))
+
+
+def _textures(house: House) -> HouseTextures | None:
+    """The textures of all bodies' faces, in order; None where no mesh has any."""
+    images, first = list[U8](), dict[Path, int]()
+    numbers, places = list[I32](), list[F32]()
+    for body in house.bodies:
+        file, n = body.visual.file, len(body.visual.faces)
+        if file is None:
+            found, rows = _BARE, np.zeros(n, np.int32)
+        else:
+            found, rows = read_textures(file.path), file.faces
+            if file.path not in first:
+                first[file.path] = len(images)
+                images += found.images
+        number = found.image.take(rows)
+        numbers.append(number if file is None else np.where(number < 0, -1, number + first[file.path]))
+        places.append(found.uv.take(rows, axis=0))
+    if not images:
+        return None
+    sizes = np.array([image.shape[:2] for image in images], np.int32)
+    starts = np.cumsum([0, *sizes.prod(1)])[:-1]
+    u_v = np.concatenate(places).transpose(2, 1, 0).copy()  # (2, 3, F)
+    u_v[:, 1:] -= u_v[:, :1]
+    texels = np.concatenate([image.reshape(-1, 3) for image in images])
+    at = np.vstack([starts, sizes.T]).astype(np.int32)
+    return HouseTextures(texels, at, np.concatenate(numbers), u_v.reshape(6, -1))
 
 
 def _pattern(house: House, body: StaticBody, rgb: tuple[int, int, int]) -> tuple[float, ...]:

@@ -102,6 +102,8 @@ class _Lighting:
         values = np.column_stack([hits.face, hits.face])
         rgb = values.view(np.uint8)[:, 4:7]
         rgb[:] = surface_colour(rays, hits)
+        if rays is self.scene.house and self.cover.textures is not None:
+            self.cover.textures.paint(rgb, hits.face, hits.barycentric)
         return values
 
     def _lit(self, values: I32, depth_m: F32, body: I16, rays: F32) -> I32:

@@ -115,24 +115,51 @@ def test_patterns_follow_the_name_and_the_house_and_far_joints_fade() -> None:
     assert wall.std() > 4 * bricks(far).std() > 0
 
 
-def test_base_colours_and_textures_of_meshes_appear_in_the_frame(tmp_path: Path) -> None:
-    """A face has one colour: that of its texture's middle, or its material's factor."""
-    boxes: list[Any] = []
-    for x, rgb, is_image in ((1.75, (200, 40, 30), True), (2.25, (30, 60, 200), False)):
-        box: Any = trimesh.creation.box(extents=(0.2, 0.2, 0.2))
-        box.apply_translation((x, 0.85, -1.5))
-        image = Image.new("RGB", (8, 8), rgb) if is_image else None
-        material = PBRMaterial(baseColorTexture=image, baseColorFactor=None if is_image else [*rgb, 255])
-        uv = np.full((len(box.vertices), 2), 0.5)
-        box.visual = TextureVisuals(uv=uv, material=material)
-        boxes.append(box)
-    data: Any = trimesh.Scene(boxes).export(file_type="glb")
-    (tmp_path / "a.glb").write_bytes(data)
-    turn = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-    mesh = read_glb(tmp_path / "a.glb").transformed(turn)
-    body = replace(box_body("boxes", "small", "Box", (0.1, 0.1, 0.1), (0, 0, 0)), visual=mesh)
-    rgb = seen(table_house([body]), ABOVE).rgb.reshape(-1, 3).astype(float)
-    for expected in (200, 40, 30), (30, 60, 200):
-        hue = np.array(expected) / np.linalg.norm(expected)
-        hues = rgb / np.linalg.norm(rgb, axis=1, keepdims=True)
-        assert (np.linalg.norm(hues - hue, axis=1) < 0.03).sum() > 100
+TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # to z up
+RED, BLUE = (200, 40, 30), (30, 60, 200)
+
+
+def box_with(material: PBRMaterial, x_m: float) -> Any:
+    """A box above the table, in a frame with y up; each face shows the whole image of the material."""
+    box: Any = trimesh.creation.box(extents=(0.2, 0.2, 0.2))
+    box.unmerge_vertices()
+    sides = np.argmax(np.abs(box.face_normals), axis=1).repeat(3)
+    others = np.array([[2, 1], [0, 2], [0, 1]])[sides]
+    uv = np.take_along_axis(box.vertices, others, axis=1) / 0.2 + 0.5
+    box.apply_translation((x_m, 0.85, -1.5))
+    box.visual = TextureVisuals(uv=uv, material=material)
+    return box
+
+
+def has_hue(rgb: np.ndarray, hue: tuple[int, int, int]) -> np.ndarray:
+    """Whether each pixel (H, W) has the hue, in any light."""
+    units = [c / np.linalg.norm(c, axis=-1, keepdims=True) for c in (rgb.astype(float), np.array(hue))]
+    return np.linalg.norm(units[0] - units[1], axis=-1) < 0.03
+
+
+def house_with(tmp_path: Path, boxes: list[Any]) -> House:
+    """A plain box, and the boxes as one body, read from a file."""
+    (tmp_path / "a.glb").write_bytes(trimesh.Scene(boxes).export(file_type="glb"))
+    plain = box_body("plain", "small", "Box", (0.1, 0.1, 0.1), (1.2, 1.5, 0.8))
+    return table_house([plain, replace(plain, visual=read_glb(tmp_path / "a.glb").transformed(TURN))])
+
+
+def test_textures_of_meshes_appear_by_pixel_in_pictures_alone(tmp_path: Path) -> None:
+    """The left half of an image is red, the right half blue; boxes beside it have a colour, and no image."""
+    image = Image.new("RGB", (8, 8), RED)
+    image.paste(BLUE, (4, 0, 8, 8))
+    grey, halves = PBRMaterial(baseColorFactor=[90, 90, 90, 255]), PBRMaterial(baseColorTexture=image)
+    house = house_with(tmp_path, [box_with(grey, 1.5), box_with(halves, 2.0), box_with(grey, 2.5)])
+    red, blue = (has_hue(seen(house, ABOVE).rgb, hue) for hue in (RED, BLUE))
+    assert red.sum() > 100 and blue.sum() > 100
+    assert np.flatnonzero(red.any(0)).max() < np.flatnonzero(blue.any(0)).min()
+    stage = stage_with([box_model("box", (0.02, 0.02, 0.02))], [(0.0, 0.0)], house)
+    red, blue = (has_hue(render_embree(stage, ABOVE).rgb, hue) for hue in (RED, BLUE))
+    assert np.flatnonzero(red.any(0)).max() > np.flatnonzero(blue.any(0)).min()  # a colour for each triangle
+
+
+def test_a_material_tints_its_texture(tmp_path: Path) -> None:
+    white = Image.new("RGB", (8, 8), (255, 255, 255))
+    material = PBRMaterial(baseColorTexture=white, baseColorFactor=[*RED, 255])
+    house = house_with(tmp_path, [box_with(material, 2.0)])
+    assert has_hue(seen(house, ABOVE).rgb, RED).sum() > 200

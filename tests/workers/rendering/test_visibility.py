@@ -66,7 +66,7 @@ def test_a_ball_fills_its_window_as_a_disc_does_and_an_eye_inside_it_sees_nothin
     st.lists(st.tuples(st.floats(-0.4, 0.4), st.floats(-0.3, 0.3)), min_size=4, max_size=4),
     st.floats(-np.pi, np.pi),
     st.floats(0.25, 1.2),
-    st.floats(0.4, 1.5),
+    st.floats(0.4, 1.5).filter(lambda z: abs(z - 0.75) > 0.005),  # in the table's top, rays only touch it
 )
 @settings(max_examples=60, deadline=None)
 def test_pixel_counts_equal_those_of_a_second_implementation(
