@@ -1,13 +1,9 @@
-"""Meshes from glTF files, within limits, with one colour per face; their textures for pictures."""
+"""Meshes from glTF files, within limits, with textures reduced to one colour per face."""
 
 from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Generator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,9 +13,9 @@ from PIL import Image
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.foreign_files import refuse_other_kind
-from datagen.workers.geometry.mesh import F32, F64, I32, U8, Mesh, MeshFile
+from datagen.workers.geometry.mesh import F64, U8, Mesh, MeshFile
 from datagen.workers.json_document import parse_json
-from datagen.workers.objects.texture import KEPT_SIDE_PX, rgb_of
+from datagen.workers.objects.texture import rgb_of
 
 MAX_FILE_BYTES = 256 << 20
 MAX_FACES = 500_000
@@ -45,31 +41,8 @@ def read_glb(path: Path) -> Mesh:
 
     Raises InputError for files that are missing, damaged, empty or beyond the limits.
     """
-    with _named(path):
-        return _merged(path, read_pieces(path, "glb"))
-
-
-@dataclass(frozen=True, eq=False)
-class FaceTextures:
-    """The images of a file (H, W, 3) of at most 512 pixels a side, and where its faces lie on them."""
-
-    images: tuple[U8, ...]
-    image: I32  # (F,), -1 without
-    uv: F32  # (F, 3, 2), origin at the image's lower left corner; outside [0, 1] it repeats
-
-
-@lru_cache(maxsize=256)
-def read_textures(path: Path) -> FaceTextures:
-    """The textures of a file that `read_glb` reads, times their material's factor. InputError as there."""
-    with _named(path):
-        return _textures(read_pieces(path, "glb"))
-
-
-@contextmanager
-def _named(path: Path) -> Generator[None]:
-    """Raise InputError with the file's name for damage."""
     try:
-        yield
+        return _merged(path, read_pieces(path, "glb"))
     except DAMAGE as error:
         if isinstance(error, InputError):
             raise
@@ -156,54 +129,30 @@ def _merged(path: Path, pieces: list[Any]) -> Mesh:
     )
     if not keep.any():
         raise ValueError("no triangle with three different corners")
-    return Mesh(
-        (keys * 1e-5).astype(np.float32),
-        indices[keep].astype(np.int32),
-        np.concatenate(colours)[keep],
-        file=MeshFile(path, np.flatnonzero(keep).astype(np.int32)),
-    )
+    rgb, file = np.concatenate(colours)[keep], MeshFile(path, np.flatnonzero(keep).astype(np.int32))
+    return Mesh((keys * 1e-5).astype(np.float32), indices[keep].astype(np.int32), rgb, file=file)
 
 
 def _face_rgb(piece: Any) -> U8:
     """Face colours (F, 3): vertex colours, the texture at the middle, or the material's factor."""
-    if piece.visual.kind in ("vertex", "face"):
-        return np.asarray(piece.visual.face_colors)[:, :3].astype(np.uint8)
-    rgb, image, uv = _material(piece)
-    if image is None:
-        return np.tile(rgb.astype(np.uint8), (len(piece.faces), 1))
-    pixels, middle = np.asarray(image), uv.mean(1) % 1.0
-    rows = np.clip(((1.0 - middle[:, 1]) * image.height).astype(int), 0, image.height - 1)
-    columns = np.clip((middle[:, 0] * image.width).astype(int), 0, image.width - 1)
-    return (pixels[rows, columns] * (rgb / 255)).astype(np.uint8)
-
-
-def _textures(pieces: list[Any]) -> FaceTextures:
-    images: list[U8] = []
-    numbers, places = list[I32](), list[F32]()
-    for piece in pieces:
-        rgb, image, uv = _material(piece)
-        if image is not None:
-            image.thumbnail((KEPT_SIDE_PX, KEPT_SIDE_PX), Image.Resampling.BOX)
-            images.append((np.asarray(image) * (rgb / 255)).astype(np.uint8))
-        number = -1 if image is None else len(images) - 1
-        numbers.append(np.full(len(piece.faces), number, np.int32))
-        places.append(np.clip(np.nan_to_num(uv), -_FARTHEST, _FARTHEST).astype(np.float32))
-    return FaceTextures(tuple(images), np.concatenate(numbers), np.concatenate(places))
-
-
-def _material(piece: Any) -> tuple[F64, Image.Image | None, F64]:
-    """The colour (3,) of a piece from 0 to 255, its image, None without, and its faces (F, 3, 2) on that."""
+    count = len(piece.faces)
     visual = piece.visual
+    if visual.kind == "vertex" or visual.kind == "face":
+        return np.asarray(visual.face_colors)[:, :3].astype(np.uint8)
     material = getattr(visual, "material", None)
     factor = getattr(material, "baseColorFactor", None)
-    image, uv = getattr(material, "baseColorTexture", None), getattr(visual, "uv", None)
-    if uv is None or len(uv) != len(piece.vertices):
-        image, uv = None, np.zeros((len(piece.vertices), 2))
-    if image is not None and image.width * image.height > _MAX_TEXTURE_PX:
-        raise ValueError("a texture of more than 64 million pixels")
-    plain = _PLAIN if image is None else (255, 255, 255)
-    rgb = np.array(plain if factor is None else np.asarray(factor)[:3], np.float64)
+    rgb = np.array(_PLAIN if factor is None else np.asarray(factor)[:3], np.float64)
     if factor is not None and np.asarray(factor).dtype.kind == "f":
         rgb = rgb * 255
-    uv = np.asarray(uv, np.float64)[piece.faces]
-    return np.clip(rgb, 0, 255), None if image is None else rgb_of(image), uv
+    image = getattr(material, "baseColorTexture", None)
+    uv = getattr(visual, "uv", None)
+    if image is None or uv is None or len(uv) != len(piece.vertices):
+        return np.tile(np.clip(rgb, 0, 255).astype(np.uint8), (count, 1))
+    if image.width * image.height > _MAX_TEXTURE_PX:
+        raise ValueError("a texture of more than 64 million pixels")
+    pixels = np.asarray(rgb_of(image))
+    middle = np.asarray(uv, np.float64)[piece.faces].mean(1) % 1.0
+    rows = np.clip(((1.0 - middle[:, 1]) * image.height).astype(int), 0, image.height - 1)
+    columns = np.clip((middle[:, 0] * image.width).astype(int), 0, image.width - 1)
+    tint = 1.0 if factor is None else np.clip(rgb, 0, 255) / 255
+    return (pixels[rows, columns] * tint).astype(np.uint8)

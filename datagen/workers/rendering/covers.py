@@ -12,8 +12,8 @@ import numpy.typing as npt
 from datagen.workers.furniture.asset_geometry import SHAPES
 from datagen.workers.furniture.solids import hash_bytes
 from datagen.workers.geometry.mesh import F32, I32, U8
-from datagen.workers.houses.glb import FaceTextures, read_textures
 from datagen.workers.houses.house import House, StaticBody
+from datagen.workers.objects.surfaces import Surface, SurfaceReader
 
 I16 = npt.NDArray[np.int16]
 # Length, width, joint of cells (m), shift of a row (cells); shares of the colour: that of joints, spread of
@@ -27,7 +27,6 @@ _PATTERNS = {  # by the first of these words in the name of a material
 }
 _PLAIN = (*_GRAIN[:6], 0.0, 1.0, 0, 0)
 _WOODEN = {t for t, (_, palette) in SHAPES.items() if palette == SHAPES["Desk"][1]} - {"Painting"} | {"Door"}
-_BARE = FaceTextures((), np.full(1, -1, np.int32), np.zeros((1, 3, 2), np.float32))
 _RANDOM = np.random.default_rng(0).uniform(-1, 1, 256).astype(np.float32)
 
 
@@ -97,29 +96,32 @@ def house_cover(house: House) -> Cover:
 
 def _textures(house: House) -> HouseTextures | None:
     """The textures of all bodies' faces, in order; None where no mesh has any."""
-    images, first = list[U8](), dict[Path, int]()
-    numbers, places = list[I32](), list[F32]()
-    for body in house.bodies:
-        file, n = body.visual.file, len(body.visual.faces)
-        if file is None:
-            found, rows = _BARE, np.zeros(n, np.int32)
-        else:
-            found, rows = read_textures(file.path), file.faces
-            if file.path not in first:
-                first[file.path] = len(images)
+    meshes = [body.visual for body in house.bodies]
+    image = np.full(sum(len(mesh.faces) for mesh in meshes), -1, np.int32)
+    uv = np.zeros((len(image), 3, 2), np.float32)
+    images, first, start = list[U8](), dict[Path, int](), 0
+    for mesh in meshes:
+        start += len(mesh.faces)
+        if mesh.file is not None and (found := _surface(mesh.file.path)).images:
+            if mesh.file.path not in first:
+                first[mesh.file.path] = len(images)
                 images += found.images
-        number = found.image.take(rows)
-        numbers.append(number if file is None else np.where(number < 0, -1, number + first[file.path]))
-        places.append(found.uv.take(rows, axis=0))
+            rows, faces = mesh.file.faces, slice(start - len(mesh.faces), start)
+            image[faces] = np.where(found.image[rows] < 0, -1, found.image[rows] + first[mesh.file.path])
+            uv[faces] = found.uv[rows]
     if not images:
         return None
-    sizes = np.array([image.shape[:2] for image in images], np.int32)
+    sizes = np.array([pixels.shape[:2] for pixels in images])
     starts = np.cumsum([0, *sizes.prod(1)])[:-1]
-    u_v = np.concatenate(places).transpose(2, 1, 0).copy()  # (2, 3, F)
-    u_v[:, 1:] -= u_v[:, :1]
-    texels = np.concatenate([image.reshape(-1, 3) for image in images])
+    uv[:, 1:] -= uv[:, :1]
+    texels = np.concatenate([pixels.reshape(-1, 3) for pixels in images])
     at = np.vstack([starts, sizes.T]).astype(np.int32)
-    return HouseTextures(texels, at, np.concatenate(numbers), u_v.reshape(6, -1))
+    return HouseTextures(texels, at, image, uv.transpose(2, 1, 0).reshape(6, -1))
+
+
+@lru_cache(maxsize=256)
+def _surface(path: Path) -> Surface:
+    return SurfaceReader(path.parent).read(path)
 
 
 def _pattern(house: House, body: StaticBody, rgb: tuple[int, int, int]) -> tuple[float, ...]:
