@@ -280,7 +280,7 @@ def predict(given: PredictOptions) -> Prediction:
         read_place(each, given.depth_scale) if isinstance(each, (str, Path)) else each
         for each in _required(named or None, "--frame")
     ]
-    own_height = given.robot_camera_height or given.camera_height
+    own_height = given.camera_height if given.robot_camera_height is None else given.robot_camera_height
     if own_height is None and frames and (pose := frames[0].T_world_camera) is not None:
         own_height = float(pose[2, 3])
     maps, keep_out = (
