@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import product
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -64,7 +64,7 @@ def ray_mesh(mesh: Mesh) -> RayMesh:
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
-    hierarchy = EmbreeScene()
+    hierarchy = EmbreeScene(_device())
     TriangleMesh(
         hierarchy,
         np.ascontiguousarray(mesh.vertices_m, np.float32),
@@ -76,6 +76,17 @@ def ray_mesh(mesh: Mesh) -> RayMesh:
     # Embree builds on the first query; doing it here keeps that cost out of the stages that time rays.
     nearest(rays, np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
     return rays
+
+
+@cache
+def _device() -> Any:
+    """The one device of this process: each takes a key of thread-local storage, of which there are 1024.
+
+    With a device for each mesh, as is the default, a process with a thousand objects ended.
+    """
+    from embreex.rtcore import EmbreeDevice
+
+    return EmbreeDevice()
 
 
 # An entry lives as long as its house or object.

@@ -9,10 +9,10 @@ import pytest
 
 from datagen.workers.geometry.mesh import Mesh, face_normals
 from datagen.workers.rendering import Camera, Renderer, SceneGeometry
-from datagen.workers.rendering.embree import ray_scene, render_embree
+from datagen.workers.rendering.embree import nearest, ray_mesh, ray_scene, render_embree
 from datagen.workers.rendering.visibility import visible_pixels
 from tests.workers.rendering.engines import assert_same_hues, assert_same_view, cameras, mixed_stage
-from tests.workers.worlds import box_body, camera_at, table_house
+from tests.workers.worlds import box_body, box_model, camera_at, table_house
 
 
 @pytest.fixture
@@ -119,3 +119,11 @@ def test_worlds_of_bullet_are_closed_at_the_end(render: Renderer) -> None:
 def test_normals_follow_the_corners_and_faces_without_area_have_none() -> None:
     corners = np.array([[[0, 0, 0], [2, 0, 0], [0, 3, 0]], [[1, 1, 1]] * 3], np.float32)
     np.testing.assert_array_equal(face_normals(corners), [[0, 0, 1], [0, 0, 0]])
+
+
+def test_a_process_keeps_thousands_of_meshes_ready_for_rays() -> None:
+    """Embree's device takes one of 1024 keys of thread-local storage: meshes share one."""
+    box = box_model("box", (0.1, 0.1, 0.1)).visual
+    kept = [ray_mesh(box) for _ in range(1500)]
+    down = np.array([[0.0, 0.0, -1.0]], np.float32)
+    assert nearest(kept[-1], -down, down) == pytest.approx(0.95)
