@@ -121,7 +121,7 @@ def _textures(house: House) -> HouseTextures | None:
 
 @lru_cache(maxsize=256)
 def _surface(path: Path) -> Surface:
-    return SurfaceReader(path.parent).read(path)
+    return SurfaceReader(path.resolve().parent).read(path)  # which may be a link
 
 
 def _pattern(house: House, body: StaticBody, rgb: tuple[int, int, int]) -> tuple[float, ...]:
