@@ -139,11 +139,12 @@ def has_hue(rgb: np.ndarray, hue: tuple[int, int, int]) -> np.ndarray:
 
 def house_with(tmp_path: Path, boxes: list[Any]) -> House:
     """A plain box, and the boxes as one body, read from a link to a file elsewhere, as of a download."""
-    (tmp_path / "downloaded").mkdir()
+    for name in "downloaded", "scenes":
+        (tmp_path / name).mkdir()
     (tmp_path / "downloaded/a").write_bytes(trimesh.Scene(boxes).export(file_type="glb"))
-    (tmp_path / "a.glb").symlink_to("downloaded/a")
+    (file := tmp_path / "scenes/a.glb").symlink_to("../downloaded/a")
     plain = box_body("plain", "small", "Box", (0.1, 0.1, 0.1), (1.2, 1.5, 0.8))
-    return table_house([plain, replace(plain, visual=read_glb(tmp_path / "a.glb").transformed(TURN))])
+    return table_house([plain, replace(plain, visual=read_glb(file).transformed(TURN))])
 
 
 def test_textures_of_meshes_appear_by_pixel_in_pictures_alone(tmp_path: Path) -> None:
