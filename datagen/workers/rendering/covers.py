@@ -27,6 +27,7 @@ _PATTERNS = {  # by the first of these words in the name of a material
 }
 _PLAIN = (*_GRAIN[:6], 0.0, 1.0, 0, 0)
 _WOODEN = {t for t, (_, palette) in SHAPES.items() if palette == SHAPES["Desk"][1]} - {"Painting"} | {"Door"}
+_FARTHEST = 1e4  # coordinate on an image; differences of larger ones may not be finite
 _RANDOM = np.random.default_rng(0).uniform(-1, 1, 256).astype(np.float32)
 
 
@@ -54,7 +55,7 @@ class HouseTextures:
 
 @dataclass(frozen=True, eq=False)
 class Cover:
-    """The patterns (10, K) of a house, the first plain, and those of its faces (F,); textures go before."""
+    """The patterns (10, K) of a house, the first plain, and those of its faces (F,); and its textures."""
 
     patterns: F32
     pattern: I16
@@ -108,7 +109,7 @@ def _textures(house: House) -> HouseTextures | None:
                 images += found.images
             rows, faces = mesh.file.faces, slice(start - len(mesh.faces), start)
             image[faces] = np.where(found.image[rows] < 0, -1, found.image[rows] + first[mesh.file.path])
-            uv[faces] = found.uv[rows]
+            uv[faces] = np.clip(found.uv[rows], -_FARTHEST, _FARTHEST)
     if not images:
         return None
     sizes = np.array([pixels.shape[:2] for pixels in images])

@@ -116,7 +116,7 @@ def test_patterns_follow_the_name_and_the_house_and_far_joints_fade() -> None:
 
 
 TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # to z up
-RED, BLUE = (200, 40, 30), (30, 60, 200)
+RED, BLUE, GREEN = (200, 40, 30), (30, 60, 200), (40, 180, 60)
 
 
 def box_with(material: PBRMaterial, x_m: float) -> Any:
@@ -151,10 +151,10 @@ def test_textures_of_meshes_appear_by_pixel_in_pictures_alone(tmp_path: Path) ->
     """The left half of an image is red, the right half blue; boxes beside it have a colour, and no image."""
     image = Image.new("RGB", (8, 8), RED)
     image.paste(BLUE, (4, 0, 8, 8))
-    grey, halves = PBRMaterial(baseColorFactor=[90, 90, 90, 255]), PBRMaterial(baseColorTexture=image)
-    house = house_with(tmp_path, [box_with(grey, 1.5), box_with(halves, 2.0), box_with(grey, 2.5)])
-    red, blue = (has_hue(seen(house, ABOVE).rgb, hue) for hue in (RED, BLUE))
-    assert red.sum() > 100 and blue.sum() > 100
+    green, halves = PBRMaterial(baseColorFactor=[*GREEN, 255]), PBRMaterial(baseColorTexture=image)
+    house = house_with(tmp_path, [box_with(green, 1.5), box_with(halves, 2.0), box_with(green, 2.5)])
+    red, blue, plain = (has_hue(seen(house, ABOVE).rgb, hue) for hue in (RED, BLUE, GREEN))
+    assert red.sum() > 100 and blue.sum() > 100 and plain.sum() > 300
     assert np.flatnonzero(red.any(0)).max() < np.flatnonzero(blue.any(0)).min()
     stage = stage_with([box_model("box", (0.02, 0.02, 0.02))], [(0.0, 0.0)], house)
     red, blue = (has_hue(render_embree(stage, ABOVE).rgb, hue) for hue in (RED, BLUE))
@@ -166,3 +166,9 @@ def test_a_material_tints_its_texture(tmp_path: Path) -> None:
     material = PBRMaterial(baseColorTexture=white, baseColorFactor=[*RED, 255])
     house = house_with(tmp_path, [box_with(material, 2.0)])
     assert has_hue(seen(house, ABOVE).rgb, RED).sum() > 200
+
+
+def test_coordinates_far_off_the_image_are_somewhere_on_it(tmp_path: Path) -> None:
+    box = box_with(PBRMaterial(baseColorTexture=Image.new("RGB", (8, 8), RED)), 2.0)
+    box.visual.uv = np.where(box.visual.uv > 0.5, 3e38, -3e38)
+    assert has_hue(seen(house_with(tmp_path, [box]), ABOVE).rgb, RED).sum() > 200
