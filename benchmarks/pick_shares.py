@@ -1,13 +1,15 @@
-"""What limits picks of base poses: the view, or labels that repeat; as a table.
+"""What limits picks of base poses: the view, the labels or the model; as a table by place and by run.
 
-    python -m benchmarks.pick_shares RUN --houses procthor:DIR --objects ycb:DIR [--draws 2] [--views 2]
+    python -m benchmarks.pick_shares RUN... --houses procthor:DIR --objects ycb:DIR [--views 2]
 
-Clear candidates within reach of scenes of a `plan` run of whole grids that have a good one. Each is labelled
-again under other draws of grasps, seeds and paths (`benchmarks.repeatability`), and each scene is observed
-from other viewpoints, from fewer where no other place sees the target. A row is a way to pick one candidate
-of a scene; columns are how often it is good by the stored labels and on average by the other draws. "Labels
-of a draw" picks by labels that know the whole scene: of the good candidates of another draw the one nearest
-to 0.75 of the reach, judged by the others.
+Runs of `plan` with whole grids and several draws, as the benchmark's. Of each scene in which most draws find
+a plan from a clear candidate, a row picks one of the clear candidates, and is judged by most draws:
+
+- nearest to 0.75 of the reach
+- the model, from the stored cloud; from another viewpoint, where one sees the target; from the clouds of all
+  viewpoints in one
+- one draw: any of those from which one draw finds a plan. It knows the whole scene: what is lacking there are
+  plans that do not repeat.
 """
 
 from __future__ import annotations
@@ -15,20 +17,21 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
-from benchmarks.repeatability import Labelling, label_scene, stored_scenes, within_reach
+from datagen.evaluation.runs import draws_of
 from datagen.schemas.run import Run
-from datagen.schemas.specification import DECISIVE_SHARES, ObservationParams, Specification
+from datagen.schemas.shard_reading import read_scenes
+from datagen.schemas.specification import PLACE_KINDS, ObservationParams, Specification
 from datagen.train.dataset import SampleStream
-from datagen.train.inputs import I64, Array, Clouds
+from datagen.train.inputs import F64, Array, Clouds
 from datagen.train.prediction import load_scorer
-from datagen.workers.rendering.cloud import Cloud, observe_cloud, stored_cloud
-from datagen.workers.rendering.embree import cast_pixels
-from datagen.workers.scenes.generate import draw_viewpoint
+from datagen.workers.rendering.cloud import Cloud, stored_cloud
+from datagen.workers.scenes.generate import observe
 from datagen.workers.scenes.placement import SceneRejected
-from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_candidates, reconstruct_scene
+from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_scene
 from datagen.workers.world import open_world
 
 _SHARE = 0.75  # of the reach
@@ -37,93 +40,77 @@ _SEED = 0
 
 
 def main() -> None:
-    """Label, observe, score and print."""
+    """Observe, score and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("run")
+    parser.add_argument("runs", nargs="+")
     parser.add_argument("--houses", default="builtin")
     parser.add_argument("--objects", default="builtin")
     parser.add_argument("--checkpoint")
-    parser.add_argument("--draws", type=int, default=2)
-    parser.add_argument("--views", type=int, default=2)
+    parser.add_argument("--views", type=int, default=2, help="other viewpoints")
     options = parser.parse_args()
-    if options.draws < 2:
-        parser.error("--draws: labels of a draw need another that judges them. Give 2 or more")
-    picked: dict[str, list[tuple[float, float]]] = {}
-    decisive = list[bool]()
-    for labels, rows in _scenes(options):
-        decisive.append(DECISIVE_SHARES[0] <= labels[0].mean() <= DECISIVE_SHARES[1])
-        for name, row in rows.items():
-            others = [labels[d, row] for d in range(1, len(labels)) if name != f"labels of draw {d}"]
-            picked.setdefault(name, []).append((float(labels[0, row]), float(np.mean(others))))
-    print(f"{len(decisive)} scenes, {sum(decisive)} decisive; {options.draws} other draws\n")
-    print("| pick | all: stored | other draws | decisive: stored | other draws |")
-    print("| --- | --- | --- | --- | --- |")
-    for name, found in picked.items():
-        good = np.array(found)
-        means = [100 * side.mean(axis=0) for side in (good, good[np.array(decisive)])]
-        print(f"| {name} | " + " | ".join(f"{value:.1f}" for mean in means for value in mean) + " |")
+    good: dict[str, list[dict[str, float]]] = {}
+    for path in options.runs:
+        for place, found in _scenes(path, options):
+            for group in (place, Path(path).name, "all"):
+                good.setdefault(group, []).append(found)
+    names = [
+        *(kind for kind in PLACE_KINDS if kind in good),
+        *(Path(path).name for path in options.runs),
+        "all",
+    ]
+    print("| pick | " + " | ".join(f"{name} ({len(good[name])})" for name in names) + " |")
+    print("| --- " * (1 + len(names)) + "|")
+    for way in good["all"][0]:
+        shares = [100 * np.mean([found[way] for found in good[name]]) for name in names]
+        print(f"| {way} | " + " | ".join(f"{share:.1f}" for share in shares) + " |")
 
 
-def _scenes(options: argparse.Namespace) -> Iterator[tuple[I64, dict[str, int]]]:
-    """Labels (1 + D, N) of a scene's candidates by draw, and the row that each way picks."""
-    run, scorer = Run.open(options.run), load_scorer(options.checkpoint)
-    spec = run.manifest.spec
+def _scenes(path: str, options: argparse.Namespace) -> Iterator[tuple[str, dict[str, float]]]:
+    """The kind of place of each feasible scene, and how good each way's pick is there."""
+    run, scorer = Run.open(path), load_scorer(options.checkpoint)
+    spec, count = run.manifest.spec, run.n // run.layout.candidates_per_scene
+    draws = draws_of(path, [spec]) or 1
     world = open_world(spec, options.houses, options.objects)
-    stream = SampleStream([options.run], scenes_per_batch=1, shuffle=False, allow_incomplete=False)
-    count = run.n // run.layout.candidates_per_scene
-    for (number, stored), batch in zip(stored_scenes(run, count), stream.epoch(0), strict=True):
-        scene = reconstruct_scene(world, stored.record)
-        candidates = reconstruct_candidates(stored.samples, scene)
-        near = np.array(within_reach(scene, candidates), np.int64)
-        labels = [stored.samples["label"][near].astype(np.int64)]
-        if not labels[0].any():
+    stream = SampleStream([path], scenes_per_batch=1, shuffle=False)
+    for stored, batch in zip(read_scenes(run, range(count)), stream.epoch(0), strict=True):
+        clear = stored.samples["base_is_clear"]
+        found = stored.samples["successes"] * clear
+        is_good = 2 * found > draws
+        if not is_good.any():
             continue
-        for draw in range(1, options.draws + 1):
-            labelling = Labelling(f"draw {draw}", spec, draw)
-            label_scene(labelling, scene, candidates, near.tolist())
-            labels.append(np.array([outcome == "success" for outcome in labelling.outcomes], np.int64))
-        off = np.abs(stored.samples["mount_distance_m"][near] / candidates.arm_reach_m[near] - _SHARE)
-        rows = {"nearest to 0.75 of the reach": int(np.argmin(off))}
-        clouds = [
-            batch.clouds,
-            *_views(scene, str(stored.record["room_id"]), spec, batch.clouds, number, options.views),
-        ]
-        seen = {"model": clouds[0], "model, another view": clouds[min(1, len(clouds) - 1)]}
-        seen[f"model, {1 + options.views} views"] = _fused(
-            clouds, spec.observation, np.random.default_rng([_SEED, number])
-        )
-        for name, cloud in seen.items():
-            rows[name] = int(np.argmax(scorer.score(replace(batch, clouds=cloud))[near]))
-        for draw in range(1, options.draws + 1):
-            rows[f"labels of draw {draw}"] = int(np.argmax(labels[draw] - off))
-        yield np.array(labels), rows
+        scene = reconstruct_scene(world, stored.record)
+        clouds = [batch.clouds, *_views(scene, stored.record, spec, batch.clouds, options.views)]
+        fused = _fused(clouds, spec.observation, np.random.default_rng([_SEED, scene.index]))
+        seen = {
+            "model": batch.clouds,
+            "model, from another viewpoint": clouds[min(1, len(clouds) - 1)],
+            f"model, clouds of {1 + options.views} viewpoints in one": fused,
+        }
+        off = np.abs(stored.samples["mount_distance_m"] / stored.samples["arm_reach_m"] - _SHARE)
+        scores = {"nearest to 0.75 of the reach": -off}
+        scores |= {way: scorer.score(replace(batch, clouds=cloud)) for way, cloud in seen.items()}
+        rated = {
+            way: _share_of_best(np.where(clear, score, -np.inf), is_good) for way, score in scores.items()
+        }
+        one_draw = float(found[is_good].sum() / found.sum())
+        yield PLACE_KINDS[int(stored.record["place"])], rated | {"one draw": one_draw}
+
+
+def _share_of_best(score: F64, is_good: Array) -> float:
+    return float(is_good[score == score.max()].mean())
 
 
 def _views(
-    scene: ReconstructedScene, room_id: str, spec: Specification, like: Clouds[Array], number: int, count: int
+    scene: ReconstructedScene, record: dict[str, Array], spec: Specification, like: Clouds[Array], count: int
 ) -> Iterator[Clouds[Array]]:
     """The scene's clouds from up to `count` other viewpoints, each drawn as the first was."""
-    house, centre_m, params = scene.house, scene.target_center_m, spec.observation
     for view in range(1, count + 1):
-        rng = np.random.default_rng([_SEED, number, view])
-        room = house.house.room(room_id)
+        item = scene.index, scene.retry, view
         try:
-            camera, _ = draw_viewpoint(
-                scene.rays, room, house.obstacles, centre_m, params, spec.candidates, rng
-            )
+            observed = observe(scene.house, str(record["room_id"]), scene.geometry, scene.rays, spec, item)
         except SceneRejected:  # no other place sees the target
             continue
-        radius_m = float(scene.rays.radii_m[0])
-        seen = observe_cloud(
-            lambda pixels, camera=camera: cast_pixels(scene.rays, camera, pixels),
-            camera,
-            1,
-            centre_m,
-            radius_m,
-            params,
-            rng,
-        )
-        yield _as(seen, like)
+        yield _as(observed[2](), like)
 
 
 def _as(seen: Cloud, like: Clouds[Array]) -> Clouds[Array]:
