@@ -66,9 +66,10 @@ model: venv
 
 # Runs are made durable file by file, which a shared disk takes ten times as long for as memory does. What
 # failed stays there to be looked at. A test worker has one core: more threads would only wait for each other.
+# Containers often keep Python from writing bytecode: each program that a test starts would be compiled again.
 # Types are checked beside the tests: the checker has one thread and takes as long as a tenth of them.
 SCRATCH := scratch=$$(mktemp -d -p /dev/shm 2>/dev/null || mktemp -d)
-TESTS := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal
+TESTS := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal
 test: style
 	@$(SCRATCH); $(TYPES) > $$scratch/types 2>&1 & types=$$!; \
 	$(TESTS) --basetemp=$$scratch/tests; tests=$$?; \
