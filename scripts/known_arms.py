@@ -12,8 +12,8 @@ import numpy as np
 
 from datagen.train.hands.sizes import measured_hand
 from datagen.workers.motion.arm_links import RADIUS, TREE
-from datagen.workers.motion.measured_reach import link_spheres, measured_arm, reaches_of, size_row
-from datagen.workers.motion.pose_reach import KNOWN_ARMS
+from datagen.workers.motion.measured_reach import link_spheres, measured_arm, reaches_of
+from datagen.workers.motion.pose_reach import KNOWN_ARMS, PoseReach
 from datagen.workers.robots import ROBOTS, gripper_of, robot_digest
 
 
@@ -33,6 +33,11 @@ def known_arms() -> dict[str, Any]:
         found |= {f"{name}/{TREE}{field}": values for field, values in tree._asdict().items()}
         found[f"{name}/{RADIUS}"] = radius_m
     return found
+
+
+def size_row(arm: PoseReach) -> list[float]:
+    """The numbers (7,) of a map beside its codes, as `known_arm` has them."""
+    return [float(arm.turns), arm.half_m, *arm.axis_xy_m.tolist(), *arm.tcp_wrist_m.tolist()]
 
 
 if __name__ == "__main__":

@@ -90,7 +90,8 @@ def run_shard(
         clock.labels = sum(len(block["label"]) for block in sample_blocks)
 
     scene_columns = {
-        f.name: _stack(f.dtype, [row[f.name] for row in scene_rows]) for f in schema.scene_fields
+        f.name: np.array([row[f.name] for row in scene_rows], object if f.dtype == "string" else f.dtype)
+        for f in schema.scene_fields
     }
     sample_columns = {name: np.concatenate([b[name] for b in sample_blocks]) for name in sample_blocks[0]}
     schema.check("scene", len(scene_rows), scene_columns)
@@ -219,7 +220,3 @@ def candidate_columns(
         "label_source": np.full(n, source.name, dtype=object),
         "label_version": np.full(n, source.version, np.int16),
     }
-
-
-def _stack(dtype: str, rows: list[Any]) -> np.ndarray[Any, Any]:
-    return np.array(rows, dtype=object if dtype == "string" else dtype)

@@ -25,6 +25,9 @@ STEP_M = 0.02
 FAR_M = 1.0
 _BLOCK = 64  # footprints per block; bounds memory
 _PAIRS = 4096  # of bases and obstacles, likewise
+_SLACK_M = 1e-6  # more than distances are rounded by
+
+Bools = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,20 +80,23 @@ class Footprint:
         return bool((found <= slack_m).all())
 
     def distances_m(
-        self, xy_m: F64, yaw_rad: F64, polygons_m: F64, distance_m: F64, counts: npt.NDArray[np.bool_]
+        self, xy_m: F64, yaw_rad: F64, polygons_m: F64, distance_m: F64, counts: Bools, only_signs: bool
     ) -> F64:
         """Distances (N, P) of the base at poses (N, 2), (N,) from obstacles (P, K, 2); negative: how deep.
 
         `distance_m` (N, P) are those of the mount. Where another obstacle that `counts` (P,) is nearer for
-        sure, or `FAR_M` is, they are only lower bounds.
+        sure, or `FAR_M` is, they are only lower bounds. With `only_signs` they all are: of those that count
+        one is negative where the base hits any.
         """
         found = distance_m - self.outer_m
         nearest = (distance_m[:, counts] - self.inner_m).min(1, initial=FAR_M)
+        if only_signs:  # it hits one for sure, or what is near decides
+            nearest = np.where(nearest < -_SLACK_M, -np.inf, _SLACK_M)
         pose, obstacle = np.nonzero(found <= nearest[:, None])
         at = polygons_at(self.polygon_m, xy_m, yaw_rad)
         for start in range(0, len(pose), _PAIRS):
             rows = pose[start : start + _PAIRS], obstacle[start : start + _PAIRS]
-            found[rows] = signed_distances_between(at[rows[0]], polygons_m[rows[1]])
+            found[rows] = signed_distances_between(at[rows[0]], polygons_m[rows[1]], only_signs)
         return found
 
 
@@ -101,7 +107,7 @@ class ObstacleDistances:
     distance_m: F64  # (N, P), negative inside; only for obstacles near any of the positions
     low_m: F64  # (P,)
     high_m: F64  # (P,)
-    indoors: npt.NDArray[np.bool_]  # (N,)
+    indoors: Bools  # (N,)
     base_m: F64 | None = None  # (N, P), of a base's polygon; None where bases are circles
 
     @staticmethod
@@ -144,10 +150,12 @@ def distances_from_obstacles(
     footprint: Footprint | None = None,
     yaw_rad: F32 | None = None,
     lowest_mount_m: float = 0.0,
+    only_signs: bool = False,
 ) -> ObstacleDistances:
     """Distances of positions (N, 2), world, from obstacles.
 
-    A `footprint` has headings (N,), and mounts from `lowest_mount_m` on.
+    A `footprint` has headings (N,), and mounts from `lowest_mount_m` on. With `only_signs` its distances are
+    only as exact as it takes to say whether it hits an obstacle.
     """
     polygons_m, low_m, base_m = obstacles.polygons_m, obstacles.low_m, None
     blocks = (
@@ -158,7 +166,7 @@ def distances_from_obstacles(
     indoors = inside_any(xy_m, obstacles.floors_m)
     if footprint is not None and yaw_rad is not None:
         heading, counts = yaw_rad.astype(np.float64), low_m < lowest_mount_m
-        base_m = footprint.distances_m(xy_m, heading, polygons_m, distance_m, counts)
+        base_m = footprint.distances_m(xy_m, heading, polygons_m, distance_m, counts, only_signs)
     return ObstacleDistances(distance_m, low_m, obstacles.high_m, indoors, base_m)
 
 

@@ -91,26 +91,26 @@ def polygons_at(polygon_m: F64, xy_m: F64, yaw_rad: F64) -> F64:
     return xy_m[:, None] + np.stack([c * x - s * y, s * x + c * y], axis=2)
 
 
-def signed_distances_between(first_m: F64, second_m: F64) -> F64:
+def signed_distances_between(first_m: F64, second_m: F64, only_signs: bool = False) -> F64:
     """Distance (M,) of counter-clockwise convex polygons (M, K, 2) and (M, L, 2), pair by pair.
 
     Negative where they overlap: the length of the shortest motion that parts them. The second ones may repeat
-    corners, and may have no area.
+    corners, and may have no area. With `only_signs` distances of polygons that are apart are lower bounds.
     """
     if second_m.shape[1] > _FEW_CORNERS:
         few = (second_m[:, _FEW_CORNERS:] == second_m[:, _FEW_CORNERS - 1, None]).all((1, 2))
         if few.any():
             distances = np.empty(len(first_m))
-            distances[few] = signed_distances_between(first_m[few], second_m[few, :_FEW_CORNERS])
-            distances[~few] = _signed_between(first_m[~few], second_m[~few])
+            distances[few] = signed_distances_between(first_m[few], second_m[few, :_FEW_CORNERS], only_signs)
+            distances[~few] = _signed_between(first_m[~few], second_m[~few], only_signs)
             return distances
-    return _signed_between(first_m, second_m)
+    return _signed_between(first_m, second_m, only_signs)
 
 
-def _signed_between(first_m: F64, second_m: F64) -> F64:
+def _signed_between(first_m: F64, second_m: F64, only_signs: bool) -> F64:
     # Of overlapping polygons the direction that parts them is normal to a side of one (separating axes).
     found = np.maximum(_beyond_sides(first_m, second_m), _beyond_sides(second_m, first_m))
-    apart = found > 0
+    apart = (found > 0) & (not only_signs)
     first_m, second_m = first_m[apart], second_m[apart]
     nearest = (_corners_to_sides(first_m, second_m), _corners_to_sides(second_m, first_m))
     found[apart] = np.minimum(*nearest)

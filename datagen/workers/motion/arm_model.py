@@ -98,7 +98,8 @@ def hand_of(gripper: Gripper, opening_m: F64) -> Hand:
 def _bodies(gripper: Gripper) -> tuple[list[list[F64]], list[list[F64]]]:
     """The hand's parts in each posture, each (V, 3), and what lies inside them."""
     bodies = [[*gripper.palm_parts_m, *left, *right] for left, right in gripper.fingers_in]
-    return [list(map(_f64, parts)) for parts in bodies], [list(map(core_of, parts)) for parts in bodies]
+    whole = [[part.astype(np.float64) for part in parts] for parts in bodies]
+    return whole, [list(map(core_of, parts)) for parts in bodies]
 
 
 def _shapes(points: F64, first: Ints, center: F64, half: F64) -> Parts:
@@ -106,10 +107,6 @@ def _shapes(points: F64, first: Ints, center: F64, half: F64) -> Parts:
     zeros = np.zeros(len(first) - 1, np.int64)
     flat = [a.reshape(-1, 3) for a in (points, center, half)]
     return Parts(flat[0], first, zeros, flat[1], flat[2], zeros)
-
-
-def _f64(part: F32) -> F64:
-    return part.astype(np.float64)
 
 
 def core_of(part: F32, depth_m: float = TOUCH_M) -> F64:

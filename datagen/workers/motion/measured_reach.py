@@ -54,11 +54,6 @@ def link_spheres(name: str) -> tuple[KinematicTree, F64]:
     return tree._replace(frame_joint=frame_joint, T_joint_frame=T_joint_frame), np.array(radii)
 
 
-def size_row(arm: PoseReach) -> list[float]:
-    """The numbers (7,) of a map beside its codes, as `known_arm` has them."""
-    return [float(arm.turns), arm.half_m, *arm.axis_xy_m.tolist(), *arm.tcp_wrist_m.tolist()]
-
-
 def _coded(reach: ReachMap) -> PoseReach:
     turns = reach.turn >= 0
     count = np.diff(reach.first).reshape(DISTANCES, HEIGHTS, -1, ROLLS, 1 if turns else AZIMUTHS)

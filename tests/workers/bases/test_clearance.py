@@ -87,10 +87,11 @@ def of_outlines(
     obstacles: Obstacles,
     radius_m: float = 0.25,
     camera_m: float = 1.2,
+    only_signs: bool = False,
 ) -> np.ndarray:
     heights = np.full((2, len(xy)), [[0.7], [camera_m]], np.float32)
     at = xy.astype(np.float32).astype(np.float64)
-    around = distances_from_obstacles(at, obstacles, footprint, yaw, 0.7)
+    around = distances_from_obstacles(at, obstacles, footprint, yaw, 0.7, only_signs)
     return around.clearance_m(*heights, np.full(len(xy), radius_m), 0.05)
 
 
@@ -181,3 +182,12 @@ def test_a_footprint_holds_smaller_bases() -> None:
     assert footprint.holds(RIDGEBACK, 0.6217, 0.001) and footprint.holds(None, 0.395, 0.001)
     assert not footprint.holds(((0.5, 0.0), (-0.3, 0.2), (-0.3, -0.2)), 0.5, 0.001)
     assert not footprint.holds(None, 0.41, 0.001)
+
+
+@given(st.integers(0, 2**32), st.sampled_from([RIDGEBACK, ((0.3, 0.1), (-0.5, 0.2), (-0.5, -0.2))]))
+@settings(max_examples=30, deadline=None)
+def test_signs_tell_the_same_bases_free(seed: int, corners: tuple[tuple[float, float], ...]) -> None:
+    (xy, yaw), house = poses(seed), obstacles_of(HOUSE)
+    measured, told = (of_outlines(Footprint(corners), xy, yaw, house, only_signs=s) for s in (False, True))
+    np.testing.assert_array_equal(told >= 0, measured >= 0)
+    assert (told <= measured + 1e-6).all()

@@ -8,12 +8,13 @@ import pytest
 from datagen.train.hands.sizes import measured_hand
 from datagen.workers.motion import pose_reach as module
 from datagen.workers.motion.arm_links import RADIUS, TREE
-from datagen.workers.motion.measured_reach import link_spheres, measured_arm, reaches_of, size_row
+from datagen.workers.motion.measured_reach import link_spheres, measured_arm, reaches_of
 from datagen.workers.motion.pose_reach import known_arm, pose_reach, reach_codes
 from datagen.workers.motion.reach_cells import cells_of
 from datagen.workers.motion.reach_map import cell_of
 from datagen.workers.robots import ROBOTS as NAMES
 from datagen.workers.robots import gripper_of, open_largest, open_robot, robot_digest
+from scripts.known_arms import size_row
 from tests.sim_extra import needs_robots, needs_sim
 
 # An arm with axes along y, one without an upright first joint, and one whose base turns.
