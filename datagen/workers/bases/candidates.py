@@ -22,7 +22,6 @@ from datagen.workers.geometry.mesh import F32, F64
 if TYPE_CHECKING:  # it needs the compiler
     from datagen.workers.motion.reachable_set import ReachableSet
 
-Bools = npt.NDArray[np.bool_]
 
 # Rounds over all cells, each with new jitter, in which a robot must find its positions.
 ROUNDS = 8
@@ -267,7 +266,9 @@ class _Rounds:
         if len(new):
             lowest_m = self._params.base_height_m.low - 1e-3  # heights of robots are rounded to float32
             xy_m, yaw_rad = self.xy_m[new].astype(np.float64), self.yaw_rad[new]
-            found = distances_from_obstacles(xy_m, self._near, self._footprint, yaw_rad, lowest_m, True)
+            found = distances_from_obstacles(
+                xy_m, self._near, self._footprint, yaw_rad, lowest_m, only_signs=True
+            )
             known.distance_m[new], known.indoors[new] = found.distance_m, found.indoors
             if known.base_m is not None and found.base_m is not None:
                 known.base_m[new] = found.base_m

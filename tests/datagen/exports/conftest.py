@@ -14,7 +14,6 @@ from tests.train.conftest import sim_run
 __all__ = ["sim_run"]
 
 SCENES = 7
-LEROBOT = ("--scenes", "0:1")
 
 
 @pytest.fixture(scope="module")
@@ -23,13 +22,6 @@ def run(shared_folder: Path) -> Path:
     out = shared_folder / "exported"
     n = SCENES * PER_SCENE - PER_SCENE // 2
     return once(out, lambda: make_small_run(out, n, "--houses", "builtin:12"))
-
-
-@pytest.fixture(scope="session")
-def lerobot_export(sim_run: Path, shared_folder: Path) -> Path:
-    """An export to LeRobot of the first scene of trials, as LEROBOT says. Read it, never change it."""
-    out = shared_folder / "lerobot"
-    return once(out, lambda: export(sim_run, "lerobot", out, *LEROBOT))
 
 
 def export(run: Path, to: str, out: Path, *more: str) -> Path:

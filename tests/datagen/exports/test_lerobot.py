@@ -19,16 +19,19 @@ from scipy.spatial.transform import Rotation
 from datagen.exports.mp4 import Video
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import OUTCOMES
+from tests.datagen.exports.conftest import export
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
 from tests.small_runs import arrays_of
 
 
-@pytest.fixture
-def lerobot(lerobot_export: Path, sim_run: Path) -> tuple[Path, np.ndarray]:
-    """The export, and the rows of the run whose plans were executed in its scene."""
+@pytest.fixture(scope="module")
+def lerobot(sim_run: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """An export of the first two scenes, and the rows of the run whose plans were executed in them."""
+    out = export(sim_run, "lerobot", tmp_path_factory.mktemp("lerobot") / "out", "--scenes", "0:2")
     arrays = arrays_of(sim_run)
-    return lerobot_export, np.flatnonzero((arrays["attempts"] > 0) & (arrays["sample_scene_index"] == 0))
+    executed = (arrays["attempts"] > 0) & (arrays["sample_scene_index"] < 2)
+    return out, np.flatnonzero(executed)
 
 
 @needs_sim
