@@ -143,6 +143,27 @@ def test_lerobot_names_the_extra_where_pyav_lacks_the_encoder(monkeypatch: pytes
         Video((320, 240), 20)
 
 
+def test_a_videos_bytes_do_not_depend_on_what_memory_held() -> None:
+    code = (
+        "import sys; import numpy as np; from PIL import Image; from datagen.exports.mp4 import Video\n"
+        "pixels = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)\n"
+        "video, scene = Video((320, 240), 20), Image.fromarray(pixels).resize((640, 480))\n"
+        "for k in range(12): video.add(scene.crop((9 * k, 5 * k, 9 * k + 320, 5 * k + 240)))\n"
+        "sys.stdout.buffer.write(video.finished())"
+    )
+    # By glibc's malloc, which fills memory with a byte: 0xFE and 0x7F.
+    first, again = (
+        subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True,
+            check=True,
+            env=os.environ | {"MALLOC_PERTURB_": held},
+        ).stdout
+        for held in ("1", "128")
+    )
+    assert first == again and len(first) > 10_000
+
+
 @needs_sim
 def test_lerobot_opens_with_its_own_reader(lerobot: tuple[Path, np.ndarray]) -> None:
     python = os.environ.get("DATAGEN_LEROBOT", sys.executable)
