@@ -26,10 +26,9 @@ from datagen.workers.kinematics.contacts import (
     touching_pairs,
 )
 from datagen.workers.motion.planning_scene import still_of
-from datagen.workers.robots.robot import Robot
 from tests.workers.kinematics.trees import random_coordinates, random_pose
 from tests.workers.oracles import Hulls, TreeOracle
-from tests.workers.robots.robots_under_test import CASES, opened
+from tests.workers.robots.robots_under_test import CASES, Case, opened
 
 SEEDS = st.integers(0, 2**32 - 1)
 NEAR_ONE = 1e-5  # m; coal's distances are exact to a millionth
@@ -198,9 +197,9 @@ def test_parts_of_nothing_touch_nothing() -> None:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_robot_touches_itself_where_coal_says_so(case: tuple[str, float | None, float]) -> None:
+def test_a_robot_touches_itself_where_coal_says_so(case: Case) -> None:
     """Pair by pair in random configurations, of all pairs of links that one joint does not hold together."""
-    robot: Robot = opened(case)
+    robot = opened(case)
     own, rng, oracle = robot.self_collision, np.random.default_rng(2), TreeOracle(robot.tree)
     parts, links = own.parts, own.parts.owner
     pairs = np.array([(a, b) for a in range(len(links)) for b in range(a) if links[a] != links[b]], np.int64)

@@ -21,10 +21,9 @@ from datagen.workers.kinematics.inverse import (
     tcp_pose,
 )
 from datagen.workers.kinematics.tree import Coordinates, KinematicTree, frame_poses
-from datagen.workers.robots.robot import Robot
 from tests.workers.kinematics.trees import random_coordinates, random_pose, random_tree
 from tests.workers.oracles import TreeOracle, off_goal, pin, se3
-from tests.workers.robots.robots_under_test import CASES, opened
+from tests.workers.robots.robots_under_test import CASES, Case, opened
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -56,8 +55,8 @@ def test_any_tree_moves_as_in_pinocchio(seed: int) -> None:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_every_robot_moves_as_in_pinocchio(case: tuple[str, float | None, float]) -> None:
-    robot: Robot = opened(case)
+def test_every_robot_moves_as_in_pinocchio(case: Case) -> None:
+    robot = opened(case)
     rng = np.random.default_rng(1)
     for _ in range(10):
         check_kinematics(robot.tree, rng)

@@ -11,10 +11,9 @@ from datagen.workers.motion.arm_motion import NO_HAND, Search, is_blocked
 from datagen.workers.motion.hand_motion import NOTHING, TARGET
 from datagen.workers.motion.plan_candidate import _Search  # pyright: ignore
 from datagen.workers.motion.planning_scene import PlanningScene
-from datagen.workers.robots.robot import Robot
 from tests.workers.motion.plan_checks import SceneJudge
 from tests.workers.motion.tables import PARAMS, arm, front_base, prepared, table_scene
-from tests.workers.robots.robots_under_test import CASES, opened
+from tests.workers.robots.robots_under_test import CASES, Case, opened
 from tests.workers.worlds import box_body, box_model
 
 CLUTTER = [
@@ -28,8 +27,8 @@ def search_at(ready: PlanningScene, base: F64) -> Search:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_configurations_are_blocked_where_the_judge_says_so(case: tuple[str, float | None, float]) -> None:
-    robot: Robot = opened(case)
+def test_configurations_are_blocked_where_the_judge_says_so(case: Case) -> None:
+    robot = opened(case)
     scene = table_scene(clutter=CLUTTER)
     ready, base = prepared(scene, robot), front_base(scene, robot, away_m=max(0.45, 0.5 * robot.reach_m))
     at, judge, rng = search_at(ready, base), SceneJudge(scene, robot, base), np.random.default_rng(4)

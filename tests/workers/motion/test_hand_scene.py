@@ -20,7 +20,6 @@ from datagen.workers.motion.hand_motion import OTHER, TARGET, Poses, Room, clear
 from datagen.workers.motion.plan_candidate import plan_candidate
 from datagen.workers.motion.planning_scene import PlanningScene, hand_scene, limits_of, still_of
 from datagen.workers.robots.gripper import Gripper
-from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes import SettledScene
 from tests.workers.motion.plan_checks import HALF_TURN
 from tests.workers.motion.tables import (
@@ -34,7 +33,7 @@ from tests.workers.motion.tables import (
     table_scene,
 )
 from tests.workers.oracles import Hulls
-from tests.workers.robots.robots_under_test import CASES, opened
+from tests.workers.robots.robots_under_test import CASES, Case, opened
 from tests.workers.worlds import box_model, box_vertices
 
 FROM_ABOVE = np.flatnonzero(box_grasps().T_object_tcp[:, 2, 2] < -0.5)
@@ -128,8 +127,8 @@ def test_the_hand_is_free_where_coal_says_so(name: str) -> None:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_fingers_follow_the_opening(case: tuple[str, float | None, float]) -> None:
-    robot: Robot = opened(case)
+def test_fingers_follow_the_opening(case: Case) -> None:
+    robot = opened(case)
     openings = np.linspace(0.01, robot.gripper.max_opening_m, 4)[:-1]
     whole = hand_of(robot.gripper, openings).whole
     count, corners = len(whole.owner), whole.first[-1]
