@@ -82,7 +82,7 @@ class Score(nn.Module):
         rows = torch.arange(AT_ONCE)[None]
         conditions = model.condition(scalars)[rows], model.condition_left(target_left)[rows]
         sides = model.pool(same, left, take_rows(frames, rows), *conditions, centres, valid).flatten(0, 1)
-        hands = model.hands(poses, robot, frames, scalars, codes)
+        hands = model.hands(poses, robot, frames, scalars, codes, AT_ONCE)
         return model.head(torch.cat([model.pooled(sides).mean(1), model.scalars(scalars), hands], dim=1))
 
 

@@ -106,7 +106,7 @@ def gather_rows(values: Tensor, rows: Tensor) -> Tensor:
     return values.gather(1, flat[..., None].expand(-1, -1, values.shape[2])).unflatten(1, rows.shape[1:])
 
 
-def take_rows(table: T, rows: Tensor) -> T:
+def take_rows(table: T, rows: Tensor | slice) -> T:
     """A dataclass of tensors, or of such dataclasses, with these rows of each tensor."""
     values: list[Any] = [getattr(table, f.name) for f in fields(table)]  # type: ignore[arg-type]
     return type(table)(*(take_rows(v, rows) if is_dataclass(v) else v[rows] for v in values))

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from datagen.train.hands.poses import N_MEASURES
+from datagen.train.models.crop import take_rows
 from datagen.train.models.frames import Frames
 from datagen.train.models.tokens import turned
 
@@ -39,23 +40,33 @@ class HandPooling(nn.Module):
         self.attention = nn.Linear(width, 1)
 
     def forward(
-        self, poses: Tensor, cloud_row: Tensor, frames: Frames, scalars: Tensor, reach: Tensor | None = None
+        self,
+        poses: Tensor,
+        cloud_row: Tensor,
+        frames: Frames,
+        scalars: Tensor,
+        reach: Tensor | None,
+        at_once: int,
     ) -> Tensor:
         """`cloud_row` (N,) has the candidates' clouds, `scalars` (N, n_scalars) their features.
 
-        `reach` (N, K, n_reach) are codes.
+        `reach` (N, K, n_reach) are codes. `at_once` candidates are in one product.
         """
-        measures, axes = poses[..., :N_MEASURES], poses[..., N_MEASURES:]
-        room = self.room(measures)[cloud_row]
-        seen = from_mount(axes.unflatten(2, (3, 3))[cloud_row], frames)
-        if reach is not None:
-            seen = torch.cat([seen, reach.to(seen.dtype) / _CODE], dim=-1)
-        hidden = self.seen(seen)
-        hidden += room
-        hidden += self.condition(scalars)[:, None]
-        hidden = self.joined(hidden)
-        share = torch.softmax(self.attention(hidden), dim=1)
-        return torch.cat([hidden.amax(1), hidden.mean(1), (share * hidden).sum(1)], dim=1)
+        room, axes = self.room(poses[..., :N_MEASURES]), poses[..., N_MEASURES:].unflatten(2, (3, 3))
+        pooled: list[Tensor] = []
+        for start in range(0, len(scalars), at_once):
+            rows = slice(start, start + at_once)
+            cloud = cloud_row[rows]
+            seen = from_mount(axes[cloud], take_rows(frames, rows))
+            if reach is not None:
+                seen = torch.cat([seen, reach[rows].to(seen.dtype) / _CODE], dim=-1)
+            hidden = self.seen(seen)
+            hidden += room[cloud]
+            hidden += self.condition(scalars[rows])[:, None]
+            hidden = self.joined(hidden)
+            share = torch.softmax(self.attention(hidden), dim=1)
+            pooled.append(torch.cat([highest(hidden, 1), hidden.mean(1), (share * hidden).sum(1)], dim=1))
+        return torch.cat(pooled)
 
 
 def from_mount(axes: Tensor, frames: Frames) -> Tensor:
@@ -80,6 +91,11 @@ def from_mount(axes: Tensor, frames: Frames) -> Tensor:
     planar = torch.linalg.vector_norm(wrist[..., :2], dim=-1, keepdim=True)
     outward = (approach * wrist).sum(-1, keepdim=True) / (lengths[1] + _NEAR)
     return torch.cat([tip, approach, closing, wrist, before, above, *lengths, planar, outward], dim=-1)
+
+
+def highest(values: Tensor, dim: int) -> Tensor:
+    """The maximum over a dimension; on a CPU by its index for gradients, where `amax` compares all again."""
+    return values.max(dim).values if torch.is_grad_enabled() and not values.is_cuda else values.amax(dim)
 
 
 def tiles(robot_row: Tensor, size: int) -> list[tuple[Tensor, Tensor]]:

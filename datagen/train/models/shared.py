@@ -37,7 +37,7 @@ from datagen.train.models.frames import (
     pair_features,
     target_features,
 )
-from datagen.train.models.hand_pooling import N_SEEN_FROM_MOUNT, HandPooling, tiles
+from datagen.train.models.hand_pooling import N_SEEN_FROM_MOUNT, HandPooling, highest, tiles
 from datagen.train.models.model import Model, ModelConfig, layers, read_config
 from datagen.train.models.tokens import (
     N_KINDS,
@@ -208,31 +208,20 @@ class SharedModel(Model):
         condition, condition_left = self.condition(scalars), self.condition_left(target_left)
         size = _TILE_CUDA if scalars.is_cuda else _TILE_CPU
         cut = tiles(candidates.robot_row, size)
+        # Looked up once for all tiles: each look-up has a gradient of the size of all tokens.
+        robot, counts = torch.cat([robot for robot, _ in cut]), [len(robot) for robot, _ in cut]
+        of_tiles = (each[robot].split(counts) for each in (same, left, tokens.centres_m, tokens.valid))
         pooled = [
-            self.pool(
-                same[robot],
-                left[robot],
-                take_rows(frames, rows),
-                condition[rows],
-                condition_left[rows],
-                tokens.centres_m[robot],
-                tokens.valid[robot],
-            )
-            for robot, rows in cut
+            self.pool(of_same, of_left, take_rows(frames, rows), condition[rows], condition_left[rows], *of)
+            for (_, rows), of_same, of_left, *of in zip(cut, *of_tiles, strict=True)
         ]
         rows = torch.cat([rows.flatten() for _, rows in cut])
         sides = torch.cat([p.flatten(0, 1) for p in pooled])[torch.argsort(rows)]  # (N, 1 or 2, F)
         joined = [self.pooled(sides).mean(1), self.scalars(scalars)]
         if tokens.hand_poses is not None and self.sizes.hand_poses:
             cloud_row = robots.cloud_row[candidates.robot_row]
-            some = torch.arange(len(candidates), device=scalars.device).split(size)
             reach = self.hand_reach(tokens, clouds, candidates, robots)
-            codes = [None] * len(some) if reach is None else reach.split(size)
-            of_tiles = [
-                self.hands(tokens.hand_poses, cloud_row[rows], take_rows(frames, rows), scalars[rows], of)
-                for rows, of in zip(some, codes, strict=True)
-            ]
-            joined.append(torch.cat(of_tiles))
+            joined.append(self.hands(tokens.hand_poses, cloud_row, frames, scalars, reach, size))
         return self.head(torch.cat(joined, dim=1)).float()
 
     def visible_share(
@@ -322,14 +311,11 @@ class SharedModel(Model):
         steering = frames.steering()
         pairs = pair_features(frames, centres_m[:, None])
         weight = self.pair.weight
-        even = _product(torch.nn.functional.pad(steering, (1, 0), value=1.0), same)
-        odd = _product(steering, left)
+        even = _product(torch.nn.functional.pad(steering, (1, 0), value=1.0), same) + condition[:, :, None]
+        odd = _product(steering, left) + condition_left[:, :, None]
         # In place: on a CPU new memory for each step would cost as much as the steps.
-        even += condition[:, :, None]
-        odd += condition_left[:, :, None]
-        rest = pairs[..., 1:].flatten(0, -2).to(even.dtype)
-        even.flatten(0, -2).addmm_(rest, weight[:, 1:].T.to(even.dtype))
-        odd.addcmul_(pairs[..., :1].to(odd.dtype), weight[:, 0].to(odd.dtype))
+        even += pairs[..., 1:].to(even.dtype) @ weight[:, 1:].T.to(even.dtype)
+        odd += pairs[..., :1].to(odd.dtype) @ weight[:, :1].T.to(odd.dtype)
         sides = (even + odd, even.sub_(odd)) if self.sizes.mirrored else (even.add_(odd),)
         return torch.stack([self._pool_side(side.relu_(), valid) for side in sides], dim=2)
 
@@ -341,7 +327,7 @@ class SharedModel(Model):
             seen.split(self.sizes.tokens, dim=2), valid.split(self.sizes.tokens, dim=1), strict=True
         ):
             n = mask.sum(1).clamp(min=1)[:, None, None]
-            parts += [of_kind.amax(2), of_kind.sum(2) / n]
+            parts += [highest(of_kind, 2), of_kind.sum(2) / n]
         return torch.cat(parts, dim=2)
 
 
