@@ -47,10 +47,10 @@ for robot in $OTHERS; do
     seed=$((seed + 1))
 done
 step "training, and beside it the benchmark's runs (runs.log)"
-# Training has one thread, since its bits depend on their number. Jobs in the background do not hear Ctrl-C.
+# Training has one thread, since its bits depend on their number; workers leave it a core, as they are nicer, and take
+# both when it is done. Jobs in the background do not hear Ctrl-C.
 trap 'kill $(jobs -p) 2> /dev/null || true' EXIT
-"$BIN/datagen" benchmark make --houses "procthor:$ASSETS/procthor" --objects "ycb:$ASSETS/ycb" --out runs \
-    --workers "$(($(nproc) > 1 ? $(nproc) - 1 : 1))" > runs.log 2>&1 &
+"$BIN/datagen" benchmark make --houses "procthor:$ASSETS/procthor" --objects "ycb:$ASSETS/ycb" --out runs > runs.log 2>&1 &
 datagen train sim-only "${mixes[@]}" "${views[@]}" --val val --epochs "$EPOCHS" --model-config width=96 --model-config embedding=160 \
     --model-config kinematics=true --seed 1 --encoded inputs --threads 1 --out model.ckpt
 step "the rest of the benchmark's runs"
