@@ -94,7 +94,10 @@ def from_mount(axes: Tensor, frames: Frames) -> Tensor:
 
 
 def highest(values: Tensor, dim: int) -> Tensor:
-    """The maximum over a dimension; on a CPU by its index for gradients, where `amax` compares all again."""
+    """Maxima of `values` (...) over `dim`, without it.
+
+    On a CPU by index where gradients are wanted: the gradient of `amax` compares all values again.
+    """
     return values.max(dim).values if torch.is_grad_enabled() and not values.is_cuda else values.amax(dim)
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.utils import deterministic
 
 from datagen.schemas.errors import InputError
 from datagen.train.training.checkpoints import Checkpoint, read_checkpoint
@@ -80,21 +81,22 @@ def test_a_training_is_repeated_and_resumed_bit_for_bit(
 @pytest.mark.parametrize("before", [0, 1, 2])
 def test_the_process_is_afterwards_as_it_was(one_robot_run: Path, tmp_path: Path, before: int):
     """torch's mode is of the process: 0, its default; 1 warns where an operation cannot repeat; 2 fails."""
+    memory: Any = deterministic
     training, _ = prepare_training(job_of(one_robot_run, tmp_path / "c"))
-    seen: list[int] = []
+    seen: list[tuple[int, bool]] = []
 
     def stopping() -> bool:
-        seen.append(torch.get_deterministic_debug_mode())
+        seen.append((torch.get_deterministic_debug_mode(), memory.fill_uninitialized_memory))
         return True
 
     try:
         torch.set_deterministic_debug_mode(before)
         assert not run_training(training, lambda: None, stopping=stopping)
-        assert torch.get_deterministic_debug_mode() == before
+        assert torch.get_deterministic_debug_mode() == before and memory.fill_uninitialized_memory
         next(iter(training.model.parameters())).register_hook(lambda gradient: gradient * float("nan"))
         with pytest.raises(InputError, match="gradient"):
             run_training(training, lambda: None, stopping=stopping)
-        assert torch.get_deterministic_debug_mode() == before
+        assert torch.get_deterministic_debug_mode() == before and memory.fill_uninitialized_memory
     finally:
         torch.set_deterministic_debug_mode(0)
-    assert seen == [max(before, 1)] * 2
+    assert seen == [(max(before, 1), False)] * 2
