@@ -52,7 +52,7 @@ def ray_start(said: Path, environment: Mapping[str, str], *arguments: str) -> ps
                 command, env=environment, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
             )
         while machine.poll() is None:
-            if "Ray runtime started" in said.read_text():
+            if "will now block forever" in said.read_text():  # said once the address is in its file
                 return machine
             time.sleep(0.1)
     raise AssertionError(said.read_text())
