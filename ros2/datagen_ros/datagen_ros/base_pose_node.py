@@ -2,7 +2,7 @@
 
 Never run on a live graph, neither on a robot nor in a simulator: subscriptions and their quality of service,
 tf, the service, the action and its cancellation, and Nav2. What runs in tests is `conversions.py`, with
-serialised messages against a running service.
+serialised messages against a running service, and how a drive ends, with a script in place of Nav2.
 """
 
 from __future__ import annotations
@@ -178,6 +178,8 @@ class BasePoseNode(Node):
             self._driving = await self._navigator.send_goal_async(goal, feedback_callback=show)
             if not self._driving.accepted:
                 continue
+            if handle.is_cancel_requested:  # since before Nav2 had a goal to cancel
+                self._driving.cancel_goal_async()
             outcome = await self._driving.get_result_async()
             if outcome.status == GoalStatus.STATUS_SUCCEEDED:
                 result.success = True
