@@ -34,8 +34,8 @@ while [[ "$1" == --* ]]; do
 done
 declare -A addresses=([alpha]=127.0.0.2 [beta]=127.0.0.3)
 address=${addresses[$host]}
-if [ "$*" = "hostname --ip-address" ]; then
-    echo "$address"
+if [[ "$*" == *"hostname --ip-address"* ]]; then
+    printf '::1 127.0.1.1\\n%s fd00::2\\n' "$address"
 else
     echo "$host: $*" >> "$SLURM_SUBMIT_DIR/started"
     exec "$@" --dashboard-agent-listen-port=0
