@@ -7,6 +7,7 @@ as tf2 has them, a tree of frames that move.
 from __future__ import annotations
 
 import math
+import re
 import struct
 from array import array
 from collections.abc import Iterable, Mapping, Sequence
@@ -206,7 +207,7 @@ def _camera(
     info = bag.last(topic, recorded_ns)
     if (info.width, info.height) != (width, height):
         raise bag.error(topic, f"is for {info.width}x{info.height} pixels, but {name} has {width}x{height}")
-    is_ideal = "rect" in name
+    is_ideal = re.search("[/_]rect", name) is not None  # /direct/image_raw is none
     k = np.array(info.p).reshape(3, 4) if is_ideal and info.p[0] else np.array(info.k).reshape(3, 3)
     if not np.isfinite(k).all() or min(k[0, 0], k[1, 1]) < 1 or np.abs(k).max() > 1e5:
         raise bag.error(topic, "has no intrinsics in pixels (K)", "Calibrate the camera")

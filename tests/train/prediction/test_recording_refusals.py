@@ -6,7 +6,6 @@ import os
 import shutil
 import tracemalloc
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -110,10 +109,12 @@ def test_topics_that_are_missing(seen: Seen, tmp_path: Path, topic: str) -> None
         assert "/camera/color/camera_info (sensor_msgs/msg/CameraInfo)" in text
 
 
-def test_a_depth_image_of_an_unknown_lens(seen: Seen, tmp_path: Path) -> None:
-    sent = [replace(each, topic=each.topic.replace("image_rect_raw", "image_raw")) for each in record(seen)]
+@pytest.mark.parametrize("camera", ["/camera/", "/direct/"])
+def test_a_depth_image_of_an_unknown_lens(seen: Seen, tmp_path: Path, camera: str) -> None:
+    sent = record(seen)
     for each in sent:
-        if each.topic == DEPTH_INFO:
+        each.topic = each.topic.replace("image_rect_raw", "image_raw").replace("/camera/", camera)
+        if each.topic == DEPTH_INFO.replace("/camera/", camera):
             each.message.d, each.message.distortion_model = np.full(5, 0.01), "fov"
     refused(write(tmp_path, sent), "fov is unknown", "plumb_bob")
 
