@@ -153,8 +153,9 @@ def read_frame(
     depth_m, step_m, notes = scaled_depth(stored, depth_scale, depth)
     image = RgbdImage(colour, depth_m, camera.pinhole, chosen, step_m=step_m, notes=notes)
     sources = {"rgb": str(rgb), "depth": str(depth), "mask": str(mask)}
-    image_frame(image, T, sources)  # refuses images that do not fit
-    return image_frame(image.undistorted(camera), T, sources)
+    frame = image_frame(image, T, sources)  # refuses images that do not fit
+    undistorted = image.undistorted(camera)
+    return frame if undistorted is image else image_frame(undistorted, T, sources)
 
 
 def read_place(place: str | Path, depth_scale: float | None = None) -> SensorFrame:
