@@ -7,9 +7,9 @@ Scenes of a run of whole grids in which some clear cell is good. Each is rendere
 cloud saw it, with the noise of a stereo camera, depth in whole millimetres, and the true mask and pose.
 `predict` answers from that frame alone, from it with floor out of sight allowed, from up to three frames of
 which each further one looks where the answer before advises (`look_next`), and with a map of the house:
-"lidar" has what stands in a plane 0.2 m above the floor, "full" all that stands below the arm's mount. Plans
-are then made from the very pose, as many draws as the run has. "answered": there was a best pose; "good":
-most draws found a plan, of all scenes.
+"lidar" has what stands in a plane 0.2 m above the floor, "full" all that stands below the arm's mount; in
+turn the answer's alternatives follow a bad pose. Plans are then made from the very pose, as many draws as the
+run has. "answered": there was a best pose; "good": most draws found a plan, of all scenes.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from datagen.train.baselines.rules import Proximity, ReachShare
 from datagen.train.prediction import KnownFloor, OccupancyMap, RobotSize, load_scorer, predict, read_footprint
 from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
+from datagen.train.prediction.goals import alternatives
 from datagen.train.prediction.pictures import draw_prediction
 from datagen.train.scorers import Scorer
 from datagen.workers.bases.clearance import STEP_M, HouseObstacles
@@ -53,6 +54,7 @@ _RESOLUTION_M = 0.05
 _LIDAR_M = 0.2
 _SEED = 0
 _ALONE, _ADVISED, _MAPPED = "1 frame alone", "3 up to three frames, as advised", "5 full map"
+_IN_TURN, _TURNS = "6 full map, up to three poses in turn", 3
 
 
 def main() -> None:
@@ -95,16 +97,21 @@ def main() -> None:
         for scorer in scorers:
             first = answers[scorer.name, _ALONE]
             answers[scorer.name, _ADVISED] = _advised(scorer, scene, first, robot, k)
-        arrived = {key: _arrived(answer, stored) for key, answer in answers.items()}
+        arrived = {key: _arrived(answer, answer.best, stored) for key, answer in answers.items()}
+        mapped = answers[names[0], _MAPPED]
+        rows = () if mapped.best is None else (mapped.best, *alternatives(mapped))[:_TURNS]
+        turns = [_arrived(mapped, row, stored) for row in rows]
         candidates, spec = reconstruct_candidates(stored.samples, scene), run.manifest.spec
         arms = [arm_in_scene(scene, candidates, 0, spec, StageClock(), draw) for draw in range(draws)]
         planned: dict[Arrived | None, bool | None] = {None: None}
-        for at in dict.fromkeys(each for each in arrived.values() if each is not None):
+        for at in dict.fromkeys(each for each in (*arrived.values(), *turns) if each is not None):
             offset = at.x_m, at.y_m, at.yaw_rad
             outcomes = [try_arrival(arm, candidates, at.candidate, offset, None, spec) for arm in arms]
             planned[at] = 2 * outcomes.count("success") > draws
         for key, at in arrived.items():
             good.setdefault(key, []).append(planned[at])
+        one = any(planned[at] for at in turns) if turns else None
+        good.setdefault((names[0], _IN_TURN), []).append(one)
         levels.setdefault(answers[names[0], _MAPPED].level, []).append(bool(good[names[0], _MAPPED][-1]))
         if options.pictures is not None:
             said = [good[name, _MAPPED][-1] for name in (names[0], names[-1])]
@@ -198,11 +205,11 @@ def house_map(house: House, low_m: float, high_m: float) -> OccupancyMap:
     return OccupancyMap(house.house_id, cells, _RESOLUTION_M, origin)
 
 
-def _arrived(answer: Prediction, stored: SceneRows) -> Arrived | None:
-    """The best pose as an arrival off the candidate next to it."""
-    if answer.best is None:
+def _arrived(answer: Prediction, row: int | None, stored: SceneRows) -> Arrived | None:
+    """A pose of the answer as an arrival off the candidate next to it."""
+    if row is None:
         return None
-    xy, yaw = answer.base_xy_m[answer.best], float(answer.yaw_rad[answer.best])
+    xy, yaw = answer.base_xy_m[row], float(answer.yaw_rad[row])
     near = int(np.argmin(np.linalg.norm(stored.samples["base_xy_m"] - xy, axis=1)))
     goal = float(stored.samples["base_yaw_rad"][near])
     off, c, s = xy - stored.samples["base_xy_m"][near], np.cos(goal), np.sin(goal)

@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 import yaml
+from scipy.special import ndtr, ndtri
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import whole_file
 from datagen.train.inputs import F64
 from datagen.train.prediction.answer import Prediction
+from datagen.train.prediction.base_cells import STATES
 from datagen.workers.geometry.transforms import inverse, translation
 from datagen.workers.robots import ROBOTS, robot_source
 
@@ -22,8 +24,9 @@ ENDINGS = (".yaml", ".mcap", ".pgm")
 # Mounts of registered robots in the frames of their bases (m), without their URDFs; (0, 0) of the others.
 MOUNTS_M = {"fetch": (0.03265, 0.0), "pr2": (-0.05, -0.188), "tiago-pro": (0.06526, 0.15918)}
 _MOST = 5
-# Alternatives differ by one of both.
-_APART_M, _APART_RAD = 0.25, math.radians(30)
+# Near base poses succeed and fail together: the correlation of what lies behind their outcomes is
+# ALIKE * exp(-(d / ALIKE_M)^2 / 2) at a distance d (m), fitted by `python -m benchmarks.retries`.
+ALIKE, ALIKE_M = 0.75, 0.4
 
 
 def goal_files(file: Path) -> tuple[Path, ...]:
@@ -58,15 +61,36 @@ def write_goal(file: Path, p: Prediction, frame_id: str, stamp_ns: int) -> bool:
 
 
 def alternatives(p: Prediction) -> list[int]:
-    """Rows of up to five base poses, unlike the best and each other: fewest doubts first, then by score."""
+    """Rows of up to five base poses to try in turn after the best: on floor that was seen, if any are."""
     assert p.best is not None
-    chosen = [p.best]
-    for row in sorted(p.choice.ranked.tolist(), key=lambda each: len(p.doubts_about(each))):
-        gap_m = np.linalg.norm(p.base_xy_m[chosen] - p.base_xy_m[row], axis=1)
-        turn = np.abs((p.yaw_rad[chosen] - p.yaw_rad[row] + np.pi) % (2 * np.pi) - np.pi)
-        if len(chosen) <= _MOST and ((gap_m >= _APART_M) | (turn >= _APART_RAD)).all():
-            chosen.append(row)
-    return chosen[1:]
+    chance = p.score if p.choice.expected is None else p.choice.expected
+    others = p.choice.ranked[p.choice.ranked != p.best]
+    seen = others[p.cells.state[others] == STATES.index("clear")]
+    rows = np.array([p.best, *(seen if len(seen) else others)])
+    return rows[in_turn(chance[rows], p.base_xy_m[rows], 1 + _MOST)][1:].tolist()
+
+
+def in_turn(chance: F64, base_xy_m: F64, most: int) -> list[int]:
+    """Rows of up to `most` base poses (N, 2) to try in turn, by their chances (N,) of success.
+
+    Each is the likeliest to succeed if all before it fail. Behind each outcome is a normal variable that is
+    positive for a success; given that some are negative, the others are taken as normal with the same means
+    and covariances (assumed density filtering: Minka 2001).
+    """
+    mean = ndtri(np.clip(chance, 1e-3, 1 - 1e-3))
+    far_m = np.linalg.norm(base_xy_m[:, None] - base_xy_m, axis=2)
+    covariance = ALIKE * np.exp(-((far_m / ALIKE_M) ** 2) / 2) + (1 - ALIKE) * np.eye(len(mean))
+    chosen: list[int] = []
+    for _ in range(min(most, len(mean))):
+        std = np.sqrt(np.diag(covariance))
+        z = mean / std
+        z[chosen] = -np.inf
+        chosen.append(row := int(z.argmax()))
+        ratio = math.exp(-(z[row] ** 2) / 2) / math.sqrt(2 * math.pi) / ndtr(-z[row])
+        shift = covariance[row] / std[row]
+        mean = mean - ratio * shift
+        covariance = covariance - ratio * (ratio - z[row]) * np.outer(shift, shift)
+    return chosen
 
 
 def _base(p: Prediction) -> tuple[str, F64]:

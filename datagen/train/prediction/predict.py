@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,10 +32,14 @@ from datagen.train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_t
 from datagen.train.prediction.ground import Ground, find_ground
 from datagen.train.prediction.occupancy import KnownFloor
 from datagen.train.prediction.target import Filled, TargetBox, fill_target, locate
-from datagen.train.prediction.trained_robots import robot_notes, trained_robots
 from datagen.train.program_scorer import ProgramScorer
 from datagen.train.scorers import ModelScorer, Scorer, scored
 from datagen.workers.rendering.cloud import Cloud
+
+if TYPE_CHECKING:
+    from datagen.train.training.checkpoints import CheckpointHead
+
+_SLACK_M = 0.01  # how far a robot's sizes may be beyond those of the training data
 
 
 def load_scorer(checkpoint: str | Path | None = None) -> ModelScorer | ProgramScorer:
@@ -65,6 +70,18 @@ def load_scorer(checkpoint: str | Path | None = None) -> ModelScorer | ProgramSc
     model, head = load_model(str(checkpoint))
     name, side_deg = f"{head.model} ({head.stage})", trained_side_deg(head)
     return ModelScorer(model, name, robots=trained_robots(head), side_deg=side_deg)
+
+
+def trained_robots(head: CheckpointHead) -> dict[str, tuple[float, float]]:
+    """The least and the largest of `ROBOT_SIZES` in the training data; empty for older checkpoints."""
+    from datagen.train.dataset import ROBOT_SIZES  # imports the store, which prediction does not need
+
+    known = [origin["robots"] for origin in head.data if "robots" in origin]
+    return {
+        name: (min(sizes[name][0] for sizes in known), max(sizes[name][1] for sizes in known))
+        for name in ROBOT_SIZES
+        if known and all(name in sizes for sizes in known)
+    }
 
 
 def predict(
@@ -124,6 +141,17 @@ def predict(
     doubts = (*sizes, *_hand_doubts(target, robot))
     given = (scorer.name, robot, tuple(frames), tuple(grounds), seen, target, filled, cloud, cells)
     return Prediction(*given, score, choice, arrival, known, doubts, notes)
+
+
+def robot_notes(scorer: Scorer, robot: RobotSize) -> Iterator[str]:
+    """A note for each size of the robot that is a centimetre or more beyond those of the training data."""
+    if not isinstance(scorer, (ModelScorer, ProgramScorer)):
+        return
+    for name, (low, high) in scorer.robots.items():
+        size_m, words = getattr(robot, name), name.removesuffix("_m").replace("_", " ")
+        if not low - _SLACK_M < size_m < high + _SLACK_M:
+            trained = f"{low:g} to {high:g} m" if low < high else f"{low:g} m"
+            yield f"{words} {size_m:g} m, but the model was trained on {trained}: scores may be wrong"
 
 
 def _hand_doubts(target: TargetBox, robot: RobotSize) -> tuple[tuple[str, str], ...]:

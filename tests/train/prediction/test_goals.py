@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from PIL import Image
 from rosbags.rosbag2 import Reader
+from scipy.special import ndtri
 
 import datagen.workers.robots
 from datagen.schemas.errors import InputError
@@ -21,7 +22,7 @@ from datagen.train.inputs import Array, Batch
 from datagen.train.prediction import KnownFloor, RobotSize, predict
 from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import STATES
-from datagen.train.prediction.goals import MOUNTS_M, alternatives, write_goal
+from datagen.train.prediction.goals import ALIKE, ALIKE_M, MOUNTS_M, alternatives, in_turn, write_goal
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.robots import robot_source
 from tests.sim_extra import named_robots, needs_sim
@@ -86,26 +87,37 @@ def test_a_goal_with_its_alternatives_as_yaml(answer: Prediction, tmp_path: Path
     assert [pose_of(each["pose"]) for each in goal["alternatives"]] == [
         pytest.approx(row_pose(answer, row)) for row in rows
     ]
-    assert len(rows) == 5 and all(answer.score[row] >= 0.5 for row in rows)
-    poses = np.array([row_pose(answer, row) for row in [answer.best, *rows]])
-    for k, one in enumerate(poses):
-        gap = poses[:k] - one
-        turn = np.abs((gap[:, 2] + np.pi) % (2 * np.pi) - np.pi)
-        assert ((np.hypot(gap[:, 0], gap[:, 1]) >= 0.25) | (turn >= np.pi / 6)).all()
+    assert len({answer.best, *rows}) == 6 and all(answer.score[row] >= 0.5 for row in rows)
 
 
-def test_alternatives_with_the_fewest_doubts_come_first(answer: Prediction) -> None:
-    # Unseen cells may have the higher scores, and are doubtful.
+def test_alternatives_are_on_floor_that_was_seen_where_there_are_such(answer: Prediction) -> None:
+    # Unseen cells may have the higher scores.
     ranked, state = answer.choice.ranked, answer.cells.state.copy()
-    state[np.delete(ranked, [0, 60, 120])] = STATES.index("unseen")
-    mixed = replace(answer, cells=replace(answer.cells, state=state), doubts=())
-    rows = alternatives(mixed)
-    doubts = [len(mixed.doubts_about(row)) for row in rows]
-    assert doubts == sorted(doubts) and doubts[0] == 0 < doubts[-1]
-    assert mixed.score[rows[0]] < mixed.score[ranked[1]]
-    for count in set(doubts):
-        scores = [mixed.score[row] for row, own in zip(rows, doubts, strict=True) if own == count]
-        assert scores == sorted(scores, reverse=True)
+    state[np.delete(ranked, [60, 120])] = STATES.index("unseen")
+    unseen = replace(answer, cells=replace(answer.cells, state=state))
+    assert set(alternatives(unseen)) == {ranked[60], ranked[120]}
+    state[ranked] = STATES.index("unseen")
+    assert alternatives(unseen) == alternatives(answer) and len(alternatives(answer)) == 5
+
+
+def test_after_a_failure_a_base_pose_elsewhere_is_likelier_than_a_better_one_beside_it() -> None:
+    xy = np.array([[0.6, 0.0], [0.6, 0.05], [-0.6, 0.0], [0.0, 5.0]])
+    assert in_turn(np.array([0.95, 0.94, 0.9, 0.2]), xy, 4) == [0, 2, 1, 3]
+    far = 10.0 * np.arange(5)[:, None] * [1.0, 0.0]  # nothing in common: by chance alone
+    assert in_turn(np.array([0.5, 0.9, 0.1, 0.99, 0.7]), far, 9) == [3, 1, 4, 0, 2]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_each_pose_in_turn_is_the_likeliest_after_the_failures_of_those_before(seed: int) -> None:
+    """By simulation of the outcomes."""
+    rng = np.random.default_rng(seed)
+    xy, chance = rng.uniform(-0.8, 0.8, (8, 2)), rng.uniform(0.3, 0.95, 8)
+    far_m = np.linalg.norm(xy[:, None] - xy[None], axis=2)
+    covariance = ALIKE * np.exp(-((far_m / ALIKE_M) ** 2) / 2) + (1 - ALIKE) * np.eye(8)
+    drawn = rng.standard_normal((500_000, 8)) @ np.linalg.cholesky(covariance).T > -ndtri(chance)
+    for row in in_turn(chance, xy, 4):
+        assert drawn.mean(axis=0)[row] > drawn.mean(axis=0).max() - 0.02
+        drawn = drawn[~drawn[:, row]]
 
 
 def test_messages_that_other_readers_read(answer: Prediction, tmp_path: Path) -> None:

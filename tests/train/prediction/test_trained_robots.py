@@ -15,7 +15,7 @@ from datagen.train.dataset import ROBOT_SIZES, SampleStream
 from datagen.train.models import build_model
 from datagen.train.prediction import load_scorer
 from datagen.train.prediction.base_cells import RobotSize
-from datagen.train.prediction.trained_robots import robot_notes, trained_robots
+from datagen.train.prediction.predict import robot_notes, trained_robots
 from datagen.train.scorers import ModelScorer
 from datagen.train.training.checkpoints import read_checkpoint
 from tests.train.prediction.checkpoints import document_of, stored_with, write_untrained
