@@ -100,7 +100,7 @@ def request_query(asked: Any) -> str:
 
 
 def ranked_poses(answer: dict[str, Any]) -> list[dict[str, Any]]:
-    """Poses of the base in an answer, best first, each with `pose`, `score`, `level` and `reasons`."""
+    """Poses of the base in an answer, in the order to try them, each with `pose`, `score`, `level` and `reasons`."""
     goal = answer["goal"]
     if goal is None:
         return []
@@ -109,7 +109,7 @@ def ranked_poses(answer: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def next_pose(poses: list[dict[str, Any]], tried: Iterable[int], allow_doubtful: bool) -> int | None:
-    """Row of the best pose that was not tried; None where none is left."""
+    """Row of the first pose that was not tried; None where none is left."""
     left = set(range(len(poses))) - set(tried)
     rows = (row for row in sorted(left) if allow_doubtful or poses[row]["level"] == "good")
     return next(rows, None)
