@@ -28,7 +28,7 @@ from datagen.train.models.crop import crop_clouds, take_rows
 from datagen.train.models.frames import frames_of, target_features
 from datagen.train.models.shared import SharedModel, stretched
 from datagen.train.models.tokens import Tokens, tokens_of
-from datagen.train.prediction.trained_robots import trained_robots
+from datagen.train.prediction.predict import trained_robots
 from datagen.train.program_scorer import (
     AT_ONCE,
     CLOUD,
