@@ -77,19 +77,20 @@ def in_turn(chance: F64, base_xy_m: F64, most: int) -> list[int]:
     positive for a success; given that some are negative, the others are taken as normal with the same means
     and covariances (assumed density filtering: Minka 2001).
     """
-    mean = ndtri(np.clip(chance, 1e-3, 1 - 1e-3))
-    far_m = np.linalg.norm(base_xy_m[:, None] - base_xy_m, axis=2)
-    covariance = ALIKE * np.exp(-((far_m / ALIKE_M) ** 2) / 2) + (1 - ALIKE) * np.eye(len(mean))
-    chosen: list[int] = []
+    mean, variance = ndtri(np.clip(chance, 1e-3, 1 - 1e-3)), np.ones(len(chance))
+    chosen, failures = list[int](), list[tuple[float, F64]]()
     for _ in range(min(most, len(mean))):
-        std = np.sqrt(np.diag(covariance))
-        z = mean / std
+        z = mean / np.sqrt(variance)
         z[chosen] = -np.inf
         chosen.append(row := int(z.argmax()))
+        far_m = np.linalg.norm(base_xy_m - base_xy_m[row], axis=1)
+        covariance = np.where(far_m > 0, ALIKE, 1.0) * np.exp(-((far_m / ALIKE_M) ** 2) / 2)
+        for factor, shift in failures:
+            covariance -= factor * shift[row] * shift
         ratio = math.exp(-(z[row] ** 2) / 2) / math.sqrt(2 * math.pi) / ndtr(-z[row])
-        shift = covariance[row] / std[row]
-        mean = mean - ratio * shift
-        covariance = covariance - ratio * (ratio - z[row]) * np.outer(shift, shift)
+        shift = covariance / math.sqrt(variance[row])
+        failures.append((ratio * (ratio - z[row]), shift))
+        mean, variance = mean - ratio * shift, variance - failures[-1][0] * shift**2
     return chosen
 
 
