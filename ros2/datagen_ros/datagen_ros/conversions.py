@@ -100,7 +100,7 @@ def request_query(asked: Any) -> str:
 
 
 def ranked_poses(answer: dict[str, Any]) -> list[dict[str, Any]]:
-    """Poses of the base in an answer, in the order to try, each with `pose`, `score`, `level` and `reasons`."""
+    """Poses of the base in an answer in turn, each with `pose`, `score`, `level` and `reasons`."""
     goal = answer["goal"]
     if goal is None:
         return []
