@@ -14,9 +14,9 @@ from scipy.special import ndtr, ndtri
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import whole_file
-from datagen.train.inputs import F64
+from datagen.train.inputs import F64, Bools
 from datagen.train.prediction.answer import Prediction
-from datagen.train.prediction.base_cells import STATES
+from datagen.train.prediction.base_cells import STATES, UNSEEN
 from datagen.workers.geometry.transforms import inverse, translation
 from datagen.workers.robots import ROBOTS, robot_source
 
@@ -27,6 +27,7 @@ _MOST = 5
 # Near base poses succeed and fail together: the correlation of what lies behind their outcomes is
 # ALIKE * exp(-(d / ALIKE_M)^2 / 2) at a distance d (m), fitted by `python -m benchmarks.retries`.
 ALIKE, ALIKE_M = 0.75, 0.4
+_LATER = 1e6  # standard deviations; no chance is as small
 
 
 def goal_files(file: Path) -> tuple[Path, ...]:
@@ -61,17 +62,16 @@ def write_goal(file: Path, p: Prediction, frame_id: str, stamp_ns: int) -> bool:
 
 
 def alternatives(p: Prediction) -> list[int]:
-    """Rows of up to five base poses to try in turn after the best: on floor that was seen, if any are."""
+    """Rows of up to five base poses to try in turn after the best, those on floor that was seen first."""
     assert p.best is not None
     chance = p.score if p.choice.expected is None else p.choice.expected
-    others = p.choice.ranked[p.choice.ranked != p.best]
-    seen = others[p.cells.state[others] == STATES.index("clear")]
-    rows = np.array([p.best, *(seen if len(seen) else others)])
-    return rows[in_turn(chance[rows], p.base_xy_m[rows], 1 + _MOST)][1:].tolist()
+    rows = np.array([p.best, *p.choice.ranked[p.choice.ranked != p.best]])
+    last = (p.cells.state[rows] == STATES.index(UNSEEN)) & (rows != p.best)
+    return rows[in_turn(chance[rows], p.base_xy_m[rows], 1 + _MOST, last)][1:].tolist()
 
 
-def in_turn(chance: F64, base_xy_m: F64, most: int) -> list[int]:
-    """Rows of up to `most` base poses (N, 2) to try in turn, by their chances (N,) of success.
+def in_turn(chance: F64, base_xy_m: F64, most: int, last: Bools | None = None) -> list[int]:
+    """Rows of up to `most` base poses (N, 2), m, to try in turn by their chances (N,), `last` (N,) ones last.
 
     Each is the likeliest to succeed if all before it fail. Behind each outcome is a normal variable that is
     positive for a success; given that some are negative, the others are taken as normal with the same means
@@ -81,8 +81,9 @@ def in_turn(chance: F64, base_xy_m: F64, most: int) -> list[int]:
     chosen, failures = list[int](), list[tuple[float, F64]]()
     for _ in range(min(most, len(mean))):
         z = mean / np.sqrt(variance)
-        z[chosen] = -np.inf
-        chosen.append(row := int(z.argmax()))
+        left = z.copy() if last is None else np.where(last, z - _LATER, z)
+        left[chosen] = -np.inf
+        chosen.append(row := int(left.argmax()))
         far_m = np.linalg.norm(base_xy_m - base_xy_m[row], axis=1)
         covariance = np.where(far_m > 0, ALIKE, 1.0) * np.exp(-((far_m / ALIKE_M) ** 2) / 2)
         for factor, shift in failures:

@@ -90,12 +90,14 @@ def test_a_goal_with_its_alternatives_as_yaml(answer: Prediction, tmp_path: Path
     assert len({answer.best, *rows}) == 6 and all(answer.score[row] >= 0.5 for row in rows)
 
 
-def test_alternatives_are_on_floor_that_was_seen_where_there_are_such(answer: Prediction) -> None:
+def test_alternatives_on_floor_that_was_seen_come_first(answer: Prediction) -> None:
     # Unseen cells may have the higher scores.
     ranked, state = answer.choice.ranked, answer.cells.state.copy()
     state[np.delete(ranked, [60, 120])] = STATES.index("unseen")
     unseen = replace(answer, cells=replace(answer.cells, state=state))
-    assert set(alternatives(unseen)) == {ranked[60], ranked[120]}
+    rows = alternatives(unseen)
+    assert set(rows[:2]) == {ranked[60], ranked[120]} and answer.score[rows[0]] < answer.score[ranked[1]]
+    assert len(rows) == 5 and (state[rows[2:]] == STATES.index("unseen")).all()
     state[ranked] = STATES.index("unseen")
     assert alternatives(unseen) == alternatives(answer) and len(alternatives(answer)) == 5
 
