@@ -199,6 +199,9 @@ class PredictOptions:
             if value is not None and not (math.isfinite(value) and 0 < value <= _LARGEST_M):
                 option, problem = f"--{name.replace('_', '-')}", f"is not between 0 and {_LARGEST_M:g}"
                 raise InputError(option, f"{value:g}", problem, "Give it in metres")
+        if self.bag is not None and self.depth_scale is not None:
+            fix = "Omit it: depth of recordings is in millimetres, or in metres as floats (REP 118)"
+            raise InputError("--depth-scale", "", "is given with --bag", fix)
         if self.depth_scale is not None and not 1e-6 <= self.depth_scale <= 1e6:
             fix = "Give metres per step, or steps per metre: 0.001 or 1000 for millimetres"
             raise InputError(
@@ -269,13 +272,23 @@ def predict(given: PredictOptions) -> Prediction:
     error = None if given.arrival is None else read_arrival(given.arrival)
     direction = None if given.gravity is None else _direction(given.gravity)
     out, html, goal = (None if file is None else Path(file) for file in (given.out, given.html, given.goal))
-    named, recorded, known = given.frame or (), None, given.map
-    _refuse_outputs(out, html, goal, [*named, given.bag, *given.map, *given.keep_out, copied])
+    maps, keep_out = (
+        tuple(read_map(Path(each)) if isinstance(each, (str, Path)) else each for each in given_maps)
+        for given_maps in (given.map, given.keep_out)
+    )
+    named, recorded = given.frame or (), None
+    pictures = [each.picture for each in (*maps, *keep_out)]
+    _refuse_outputs(out, html, goal, [*named, given.bag, *given.map, *given.keep_out, *pictures, copied])
     if given.bag is not None:
         from datagen.train.prediction.recordings import read_recording
 
         recorded = read_recording(Path(given.bag), given.at, given.topic)
-        named, known = recorded.frames, given.map or [each for each in [recorded.map] if each is not None]
+        if (given.map or given.keep_out) and recorded.world.rpartition("/")[2].startswith(("odom", "base")):
+            problem = f"is no map of the frame {recorded.world}, in which the recording has its poses"
+            fix = "Record with localisation, which sends the transform from map to odom, or omit the map"
+            raise InputError("--map" if given.map else "--keep-out", "", problem, fix)
+        named = recorded.frames
+        maps = maps or tuple(each for each in [recorded.map] if each is not None)
     frames = [
         read_place(each, given.depth_scale) if isinstance(each, (str, Path)) else each
         for each in _required(named or None, "--frame")
@@ -283,10 +296,6 @@ def predict(given: PredictOptions) -> Prediction:
     own_height = given.camera_height if given.robot_camera_height is None else given.robot_camera_height
     if own_height is None and frames and (pose := frames[0].T_world_camera) is not None:
         own_height = float(pose[2, 3])
-    maps, keep_out = (
-        tuple(read_map(Path(each)) if isinstance(each, (str, Path)) else each for each in given_maps)
-        for given_maps in (known, given.keep_out)
-    )
     scorer = given.checkpoint
     answer = scored(
         load_scorer(scorer) if scorer is None or isinstance(scorer, (str, Path)) else scorer,

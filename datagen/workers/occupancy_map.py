@@ -36,6 +36,7 @@ class OccupancyMap:
     cells: np.ndarray[tuple[int, int], np.dtype[np.int8]]  # FREE, OCCUPIED or UNKNOWN
     resolution_m: float
     origin: tuple[float, float, float]  # the lower left corner (m), and the turn of the cells' x axis (rad)
+    picture: Path | None = None  # the file of its cells
 
     def states(self, xy_m: F64) -> np.ndarray[tuple[int], np.dtype[np.int8]]:
         """The cells' states (N,) at positions (N, 2); UNKNOWN beside the map."""
@@ -81,7 +82,7 @@ def read_map(path: Path) -> OccupancyMap:
         for key, default in (("occupied_thresh", 0.65), ("free_thresh", 0.25))
     )
     negated = (flag := node.find("negate")) is not None and bool(flag.value)
-    grey, alpha = read_grey(path.parent / name)
+    grey, alpha = read_grey(picture := path.parent / name)
     dark = grey / 255 if negated else 1 - grey / 255
     cells = np.full(grey.shape, UNKNOWN, np.int8)
     cells[dark > occupied] = OCCUPIED
@@ -90,4 +91,5 @@ def read_map(path: Path) -> OccupancyMap:
         cells[grey == _SAVED_UNKNOWN] = UNKNOWN
     if alpha is not None and mode == "scale":
         cells[alpha < 255] = UNKNOWN
-    return OccupancyMap(str(path), cells[::-1], resolution_m, (origin[0], origin[1], origin[2]))
+    x, y, turn = origin
+    return OccupancyMap(str(path), cells[::-1], resolution_m, (x, y, turn), picture)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[2] / "ros2" / "datagen_ros"
-REACHED, CANCELED = 4, 5  # of action_msgs/GoalStatus
+REACHED, CANCELED, ABORTED = 4, 5, 6  # of action_msgs/GoalStatus
 POSE = {"pose": {}, "score": 0.9, "level": "good", "reasons": []}
 
 
@@ -30,6 +30,7 @@ def node(monkeypatch: pytest.MonkeyPatch) -> Any:
             for alias in imported.names:
                 setattr(sys.modules[module], alias.name, type(alias.name, (SimpleNamespace,), {}))
     sys.modules["action_msgs.msg"].GoalStatus.STATUS_SUCCEEDED = REACHED
+    sys.modules["action_msgs.msg"].GoalStatus.STATUS_CANCELED = CANCELED
     sys.modules["nav2_msgs.action"].NavigateToPose.Goal = SimpleNamespace
     sys.modules["rclpy.action"].CancelResponse.ACCEPT = 2
     sys.modules["datagen_interfaces.action"].GoToBasePose.Feedback = SimpleNamespace
@@ -41,7 +42,8 @@ def node(monkeypatch: pytest.MonkeyPatch) -> Any:
         "goal": POSE,
         "alternatives": [POSE],
     }
-    made._driving, made._ask, made._stamped = None, lambda _: {"goal": goal}, lambda pose: pose
+    answer = {"goal": goal, "reasons": []}
+    made._driving, made._ask, made._stamped = None, lambda _: answer, lambda pose: pose
     return made
 
 
@@ -50,8 +52,8 @@ class Nav2:
 
     accepted = True
 
-    def __init__(self, node: Any, client: SimpleNamespace, moment: str) -> None:
-        self.node, self.client, self.moment, self.status = node, client, moment, REACHED
+    def __init__(self, node: Any, client: SimpleNamespace, moment: str, status: int = REACHED) -> None:
+        self.node, self.client, self.moment, self.status, self.goals = node, client, moment, status, 0
 
     def wait_for_server(self, timeout_sec: float) -> bool:
         return True
@@ -65,6 +67,7 @@ class Nav2:
             self.client.is_cancel_requested = True
 
     async def send_goal_async(self, goal: Any, feedback_callback: Any) -> Nav2:
+        self.goals += 1
         self._may_be_cancelled("while it considers")
         return self
 
@@ -86,3 +89,29 @@ def test_a_cancelled_drive_is_cancelled_in_nav2(node: Any, moment: str, ended: s
     node._navigator = Nav2(node, client, moment)
     asyncio.run(node._drive(client, SimpleNamespace()))
     assert ends == [ended]
+
+
+@pytest.mark.parametrize(
+    ("status", "changed", "goals", "words"),
+    [
+        (CANCELED, {}, 1, "cancelled by another program"),  # no goal follows one that somebody stopped
+        (ABORTED, {}, 2, "2 poses were tried, none was reached"),
+        (REACHED, {"goal": None, "reasons": ["no clear pose"]}, 0, "no clear pose"),
+        (
+            REACHED,
+            {"goal": {**POSE, "level": "doubtful", "goal": POSE, "alternatives": []}},
+            0,
+            "allow_doubtful",
+        ),
+    ],
+)
+def test_why_no_pose_was_reached(
+    node: Any, status: int, changed: dict[str, Any], goals: int, words: str
+) -> None:
+    request = SimpleNamespace(allow_doubtful=False)
+    client = SimpleNamespace(is_cancel_requested=False, request=request)
+    node._ask(None).update(changed)
+    node._navigator = Nav2(node, client, "never", status)
+    with pytest.raises(Exception, match=words):
+        asyncio.run(node._drive(client, SimpleNamespace()))
+    assert node._navigator.goals == goals

@@ -16,6 +16,7 @@ candidate's line to the target: the mean over both sides is taken.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal
@@ -61,6 +62,7 @@ _TILE_CPU, _TILE_CUDA = 64, 4096
 _CAMERA_ABOVE_MOUNT_M = 0.4
 _MIN_REACH_M = 0.05
 _N_VISIBILITY = 3
+_MOST_DROPPED = 0.5  # of tokens and hand poses, in training
 # The estimate needs surfaces without gaps: all points of a usual cloud.
 _VISIBILITY_POINTS = 4096
 
@@ -197,6 +199,8 @@ class SharedModel(Model):
         robots: RobotInputs[Tensor],
     ) -> Tensor:
         """Logits (N, 2) from the tokens that `encode` returned for these clouds and robots."""
+        if self.training:
+            tokens, candidates = _thinned(tokens, candidates)
         with torch.no_grad(), torch.autocast(candidates.base_xy_m.device.type, enabled=False):
             frames = self._frames(tokens, clouds, candidates, robots)
             target, target_left = target_features(frames, tokens, candidates.robot_row)
@@ -329,6 +333,21 @@ class SharedModel(Model):
             n = mask.sum(1).clamp(min=1)[:, None, None]
             parts += [highest(of_kind, 2), of_kind.sum(2) / n]
         return torch.cat(parts, dim=2)
+
+
+def _thinned(tokens: Tokens, candidates: CandidateInputs[Tensor]) -> tuple[Tokens, CandidateInputs[Tensor]]:
+    """Up to half of each robot's tokens and of all hand poses left out, at random, as dropout of inputs."""
+    valid, poses = tokens.valid, tokens.hand_poses
+    share = torch.rand(len(valid), 1, device=valid.device) * _MOST_DROPPED
+    tokens = replace(tokens, valid=valid & (torch.rand(valid.shape, device=valid.device) >= share))
+    if poses is None:
+        return tokens, candidates
+    least = math.ceil((1 - _MOST_DROPPED) * poses.shape[1])
+    count = int(torch.randint(least, poses.shape[1] + 1, ()))
+    kept = torch.randperm(poses.shape[1], device=poses.device)[:count]
+    if isinstance(candidates, EncodedCandidates) and candidates.reach is not None:
+        candidates = replace(candidates, reach=candidates.reach[:, kept])
+    return replace(tokens, hand_poses=poses[:, kept]), candidates
 
 
 def _product(steering: Tensor, of_tokens: Tensor) -> Tensor:

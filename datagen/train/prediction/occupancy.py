@@ -9,7 +9,7 @@ import numpy as np
 from datagen.train.inputs import F64
 from datagen.workers.occupancy_map import FREE, OCCUPIED, UNKNOWN, OccupancyMap
 
-# Cells are taken as points this far apart: no cell of a usual map is missed.
+# Cells are taken as points this far apart or nearer, each as several.
 _STEP_M = 0.02
 
 
@@ -24,7 +24,8 @@ class KnownFloor:
         """Positions (N, 2) that are free and (M, 2) that are occupied, between two corners (2,)."""
         if not self.maps and not self.keep_out:
             return np.empty((0, 2)), np.empty((0, 2))
-        axes = [np.arange(low, high, _STEP_M) + _STEP_M / 2 for low, high in zip(low_m, high_m, strict=True)]
+        step_m = min(_STEP_M, *(each.resolution_m / 2 for each in (*self.maps, *self.keep_out)))
+        axes = [np.arange(low, high, step_m) + step_m / 2 for low, high in zip(low_m, high_m, strict=True)]
         xy = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
         state = np.full(len(xy), UNKNOWN, np.int8)
         for each in self.maps:

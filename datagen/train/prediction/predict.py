@@ -176,6 +176,8 @@ def _grounds(
         if len(frames) > 1 and frame.T_world_camera is None:
             fix = "Give each of several frames its T_world_camera: pose.json in its folder, or in the .npz"
             raise InputError(frame.place, "pose", "missing", fix)
+    if gravity is not None and (posed := next((f for f in frames if f.T_world_camera is not None), None)):
+        raise InputError("--gravity", "", f"is given with the pose of {posed.place}", "Give one of them")
     height_m = camera_height_m if len(frames) == 1 else None
     return [find_ground(frame, height_m, gravity) for frame in frames]
 
@@ -184,14 +186,20 @@ def _with_target(
     frames: Sequence[SensorFrame], grounds: Sequence[Ground], click: tuple[int, int] | None, box: Box | None
 ) -> list[SensorFrame]:
     """The frames, the first with the mask of the object that was clicked or boxed."""
-    first, image = frames[0], frames[0].image
+    found = [marked(frames[0], grounds[0].T_world_camera, click, box), *frames[1:]]
+    if not any(frame.on_target is not None for frame in found):
+        fix = "Give --click u,v, --box, or a mask (in a .ply: a vertex property `target`, 1 on the target)"
+        raise InputError(frames[0].place, "target", "is not marked", fix)
+    return found
+
+
+def marked(
+    frame: SensorFrame, T_world_camera: F64, click: tuple[int, int] | None, box: Box | None
+) -> SensorFrame:
+    """The frame with the mask of the object that was clicked or boxed; as it is where neither was."""
+    image = frame.image
     if click is None and box is None:
-        if not any(frame.on_target is not None for frame in frames):
-            fix = (
-                "Give --click u,v, --box, or a mask (in a .ply: a vertex property `target`, 1 on the target)"
-            )
-            raise InputError(first.place, "target", "is not marked", fix)
-        return list(frames)
+        return frame
     if click is not None and box is not None:
         raise InputError("--box", "", "is given with --click", "Give one of them")
     option = "--box" if click is None else "--click"
@@ -199,14 +207,13 @@ def _with_target(
         raise InputError(option, "", "needs an image, not a cloud", "Give a frame with an image first")
     if image.mask is not None:
         raise InputError(option, "", "is given for a frame with a mask", f"Omit {option}, or the mask")
-    T = grounds[0].T_world_camera
     if click is not None:
-        mask = click_mask(image, click, T)
+        mask = click_mask(image, click, T_world_camera)
     else:
         assert box is not None
-        mask = box_mask(image, box, T)
-    where = {"depth": first.place, "mask": option}
-    return [image_frame(replace(image, mask=mask), first.T_world_camera, where), *frames[1:]]
+        mask = box_mask(image, box, T_world_camera)
+    where = {"depth": frame.place, "mask": option}
+    return image_frame(replace(image, mask=mask), frame.T_world_camera, where)
 
 
 def _fill(frames: Sequence[SensorFrame]) -> tuple[list[SensorFrame], Filled | None]:

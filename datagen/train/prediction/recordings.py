@@ -182,6 +182,9 @@ def _frame(
             raise tree.lacks(f"from {painted} to {seen}")
         picture = RgbdImage(rgb, np.zeros(rgb.shape[:2], np.float32), by.pinhole, None).undistorted(by)
         image = replace(image, rgb=_painted(image, picture, inverse(others[common]) @ poses[common]))
+    if world != "map":
+        note = f"the recording has no transform to map: poses are in {world}, and maps in other frames unused"
+        image = replace(image, notes=(*image.notes, note))
     place = f"{bag.path}: {names[1]}"
     T = checked_pose(poses[world], place)
     return image_frame(image, T, {"depth": place}), world
@@ -212,8 +215,9 @@ def _camera(
     if not np.isfinite(k).all() or min(k[0, 0], k[1, 1]) < 1 or np.abs(k).max() > 1e5:
         raise bag.error(topic, "has no intrinsics in pixels (K)", "Calibrate the camera")
     pinhole = Pinhole(float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
-    lens = () if is_ideal else tuple(np.array(info.d, np.float64).tolist())
-    return Intrinsics(f"{bag.path}: {topic}", pinhole, (width, height), info.distortion_model, lens)
+    # A model without coefficients may still be that of a fisheye.
+    model, lens = ("", []) if is_ideal else (info.distortion_model, np.array(info.d, np.float64).tolist())
+    return Intrinsics(f"{bag.path}: {topic}", pinhole, (width, height), model, tuple(lens))
 
 
 def _rgb(bag: Bag, topic: str, message: Any) -> U8:

@@ -7,9 +7,10 @@ import re
 import tempfile
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from fastapi import Depends, FastAPI, HTTPException, Query, Request
@@ -20,6 +21,7 @@ from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.files import read_arrays
 from datagen.train.prediction.frames import SensorFrame, read_place
 from datagen.train.prediction.goals import goal_document
+from datagen.train.prediction.predict import marked
 from datagen.train.prediction.prediction_report import document
 from datagen.worker_processes import WorkerProcesses
 from datagen.workers.occupancy_map import OccupancyMap, grid_map
@@ -30,12 +32,26 @@ _BODY = "body.npz"
 Ask = Callable[[list[SensorFrame], dict[str, Any]], Prediction]  # of frames and options of a request
 
 
-class Sessions(OrderedDict[str, list[bytes]]):
-    """Frames of the latest sessions. The oldest frames and the longest unused sessions go first."""
+class Sent(NamedTuple):
+    """A frame as it was sent, and where its target was marked besides a mask."""
 
-    def add(self, name: str, frame: bytes) -> None:
+    body: bytes
+    click: list[int] | None
+    box: list[int] | None
+
+    @property
+    def marks(self) -> dict[str, Any]:
+        """Its click and box, as `predict` takes them."""
+        both = {"click": self.click, "box": self.box}
+        return {name: None if given is None else tuple(given) for name, given in both.items()}
+
+
+class Sessions(OrderedDict[str, list[Sent]]):
+    """Frames of the latest sessions, the latest first. The oldest and the longest unused sessions go."""
+
+    def add(self, name: str, frame: Sent) -> None:
         """Keep a new frame of a session."""
-        self[name] = [*self.pop(name, []), frame][-MOST_FRAMES:]
+        self[name] = [frame, *self.pop(name, [])][:MOST_FRAMES]
         while len(self) > MOST_SESSIONS:
             self.popitem(last=False)
 
@@ -57,11 +73,29 @@ def _read(body: bytes) -> tuple[SensorFrame, list[OccupancyMap]]:
         return frame, [grid_map("map", grid, resolution_m, (x, y, yaw))]
 
 
-def answer_of(ask: Ask, bodies: list[bytes], options: dict[str, Any]) -> dict[str, Any]:
-    """The document of an answer; `goal` has poses of the robot's base where the frames have poses."""
-    frames, maps = zip(*map(_read, bodies), strict=True)
-    found = ask(list(frames), options | {"map": maps[-1]})
+def answer_of(ask: Ask, sent: list[Sent], options: dict[str, Any]) -> dict[str, Any]:
+    """The document of an answer; `goal` has poses of the robot's base where the frames have poses.
+
+    Of the frames, the latest first, the first that marks a target does; the latest map counts.
+    """
+    frames, maps = map(list, zip(*(_read(each.body) for each in sent), strict=True))
+    marks = (k for k, each in enumerate(sent) if frames[k].on_target is not None or each.click or each.box)
+    last = next(marks, 0)
+    for k, each in enumerate(sent):
+        if k != last:
+            frames[k] = _unmarked(frames[k])
+        elif k and (T := frames[k].T_world_camera) is not None:
+            frames[k] = marked(frames[k], T, **each.marks)
+    options = options | {"map": next(filter(None, maps), [])}
+    if last == 0:
+        options |= sent[0].marks
+    found = ask(frames, options)
     return document(found) | {"goal": goal_document(found, "map", 0)}
+
+
+def _unmarked(frame: SensorFrame) -> SensorFrame:
+    image = None if frame.image is None else replace(frame.image, mask=None)
+    return replace(frame, on_target=None, image=image)
 
 
 def make_app(workers: WorkerProcesses, model: str, token: str | None) -> FastAPI:
@@ -92,27 +126,29 @@ def make_app(workers: WorkerProcesses, model: str, token: str | None) -> FastAPI
         camera_height: Annotated[float | None, Query(gt=0, le=10)] = None,
         candidates: bool = False,
     ) -> dict[str, Any]:
-        """The base pose for the target in the frame of the body, an .npz, fused with those of its session."""
+        """The base pose for the target in the frame of the body, an .npz, fused with those of its session.
+
+        Where the frame has no mask, click or box, the target is that of the session's last frame that has.
+        """
         data = bytearray()
         async for part in request.stream():
             data += part
             if len(data) > MOST_BYTES:
                 raise HTTPException(413, f"the body has more than {MOST_BYTES >> 20} MiB")
         options = {
-            "click": None if click is None else tuple(map(int, click.split(","))),
-            "box": None if box is None else tuple(map(int, box.split(","))),
             "arrival": arrival,
             "allow_unseen": allow_unseen,
             "camera_height": camera_height,
             "candidates": candidates,
         }
-        frames = [*sessions.get(session or "", ()), bytes(data)][-MOST_FRAMES:]
+        at, sides = (None if text is None else [*map(int, text.split(","))] for text in (click, box))
+        frames = [Sent(bytes(data), at, sides), *sessions.get(session or "", ())][:MOST_FRAMES]
         try:
             found = await workers.call(frames, options)
         except InputError as error:
             raise HTTPException(422, re.sub(rf"\S*/{_BODY}", "the body", str(error))) from None
         if session is not None:  # not before: a frame that cannot be read would spoil the session
-            sessions.add(session, frames[-1])
+            sessions.add(session, frames[0])
         return found if candidates else {key: found[key] for key in found if key != "candidates"}
 
     @app.delete("/sessions/{name}")

@@ -93,10 +93,15 @@ def read_trees(source: RobotSource) -> tuple[UrdfTree, UrdfTree]:
     return bare[0], bare[0] if hand is tree else bare[1]
 
 
+_DECK = 2  # how links are checked against a deck
+
+
 def content_digest(source: RobotSource) -> str:
     """sha256 of all that a robot is made from: its keys, URDFs and collision meshes, wherever they lie."""
     keys = source.keys.model_dump(mode="json")
     keys.pop("about")
+    if source.keys.base.height_m is not None:
+        keys["deck"] = _DECK
     keys["urdf"] = keys["hand"]["urdf"] = None
     contents: list[str] = []
     trees = read_trees(source)

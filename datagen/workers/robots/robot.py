@@ -74,7 +74,8 @@ class Robot:
             *self.link_parts_m[: self.first_hand_link + 1],
             *((_joint_hull(p),) if p else () for p in fingers),
         ]
-        self.self_collision = SelfCollision(self.tree, self._poses, parts)
+        deck = None if base.deck_m is None else int(chain.turns)
+        self.self_collision = SelfCollision(self.tree, self._poses, parts, deck)
         self.self_pairs = self.self_collision.pairs  # pairs of links that must not touch
         self.homes_rad: F64 = self._tucked()  # (H, A), tucked, free of self-collision
 
@@ -179,10 +180,17 @@ class SelfCollision:
 
     Links that are fixed to one another, links on both sides of one joint and the segments of one telescope
     may always touch. Other pairs that touch in most of 300 random configurations (fixed seed) are left out
-    too: their coarse hulls overlap.
+    too: their coarse hulls overlap. The last part of the link `deck` is a base as it was given, which is exact:
+    it does not count there.
     """
 
-    def __init__(self, tree: KinematicTree, poses: TreePoses, parts_m: Sequence[Sequence[F32 | F64]]) -> None:
+    def __init__(
+        self,
+        tree: KinematicTree,
+        poses: TreePoses,
+        parts_m: Sequence[Sequence[F32 | F64]],
+        deck: int | None = None,
+    ) -> None:
         self.parts = contacts.parts_of(parts_m)
         joint = tree.frame_joint.tolist()
         rows = [
@@ -198,6 +206,8 @@ class SelfCollision:
         rng, touches = np.random.Generator(np.random.PCG64(0)), np.empty((_SAMPLES, len(pairs)), np.bool_)
         T = np.stack([poses(q) for q in rng.uniform(tree.lower, tree.upper, (_SAMPLES, len(tree.lower)))])
         contacts.touching_pairs(self._compiled, pairs, T, self._scratch, touches)
+        if deck is not None:
+            touches[:, (pairs == np.flatnonzero(self.parts.owner == deck)[-1]).any(axis=1)] = False
         count = {pair: int(touches[:, (link == pair).all(axis=1)].any(axis=1).sum()) for pair in rows}
         self.pairs = tuple(pair for pair in rows if count[pair] <= _MOST * _SAMPLES)  # of links
         self.part_pairs = _part_pairs(self.parts, self.pairs)  # (K, 2)

@@ -158,7 +158,8 @@ class BasePoseNode(Node):
 
     async def _drive(self, handle: Any, result: Any) -> None:
         """Drive to the poses in turn, until one is reached."""
-        poses, tried = ranked_poses(self._ask(handle.request)), list[int]()
+        answer, tried = self._ask(handle.request), list[int]()
+        poses = ranked_poses(answer)
         if not self._navigator.wait_for_server(timeout_sec=5.0):
             raise NoAnswerError(f"no action server {self._value('navigate_action')}")
         feedback = GoToBasePose.Feedback()
@@ -170,7 +171,10 @@ class BasePoseNode(Node):
         while not handle.is_cancel_requested:
             row = next_pose(poses, tried, handle.request.allow_doubtful)
             if row is None:
-                raise NoAnswerError(f"{len(tried)} of {len(poses)} poses were tried, none was reached")
+                why = [f"{len(tried)} poses were tried, none was reached"] if tried else answer["reasons"]
+                left = len(poses) - len(tried)
+                more = [f"{left} doubtful poses were not tried: set allow_doubtful"] if left else []
+                raise NoAnswerError("; ".join([*why, *more]))
             tried.append(row)
             result.pose, result.score = self._stamped(poses[row]["pose"]), poses[row]["score"]
             feedback.pose, feedback.tried, result.tried = result.pose, len(tried), len(tried)
@@ -185,6 +189,8 @@ class BasePoseNode(Node):
                 result.success = True
                 handle.succeed()
                 return
+            if outcome.status == GoalStatus.STATUS_CANCELED and not handle.is_cancel_requested:
+                raise NoAnswerError("Nav2's goal was cancelled by another program")
         handle.canceled()
 
 

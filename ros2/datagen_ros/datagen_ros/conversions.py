@@ -74,6 +74,9 @@ def request_body(
     sizes = {(each.width, each.height) for each in (color, depth, info)}
     if len(sizes) != 1:
         raise ValueError(f"colour, depth and CameraInfo differ in size: {sorted(sizes)}")
+    frames = [each.header.frame_id.strip("/") for each in (color, depth)]
+    if frames[0] != frames[1]:
+        raise ValueError(f"depth is not aligned to colour: their frames are {frames[1]} and {frames[0]}")
     channels, order = COLOURS[color.encoding]
     arrays: dict[str, np.ndarray] = {
         "rgb": pixels(color, "u1", channels)[..., order],

@@ -89,6 +89,11 @@ def test_no_goal_is_written_without_a_good_pose(
         (("--goal", "{tmp}/goal.json"), ".yaml or .mcap or .pgm"),
         (("--goal", "{tmp}/map.yaml", "--map", "{tmp}/map.yaml"), "file of the input"),
         (("--goal", "{tmp}/map.pgm", "--keep-out", "{tmp}/map.yaml"), "file of the input"),
+        (
+            ("--out", "{tmp}/room.png", "--map", "{tmp}/map.yaml"),
+            "file of the input",
+        ),  # the map's own picture
+        (("--depth-scale", "1000", "--bag", "{tmp}/a.mcap"), "given with --frame"),
         (("--bag", "{tmp}/a.mcap"), "given with --frame"),
         (("--at", "3"), "is for --bag"),
         (("--topic", "depth=/d"), "is for --bag"),
@@ -98,8 +103,15 @@ def test_no_goal_is_written_without_a_good_pose(
 def test_options_of_recordings_and_goals(
     options: tuple[str, ...], words: str, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    Image.new("L", (9, 9), 254).save(tmp_path / "room.png")
+    (tmp_path / "map.yaml").write_text("image: room.png\nresolution: 0.05\norigin: [0, 0, 0]\n")
     given = [each.format(tmp=tmp_path) for each in options]
     refused([*arguments(made), *given], capsys, words)
+
+
+def test_gravity_is_refused_for_a_frame_with_a_pose(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = arguments(made, "--frame", str(made / "posed"), "--gravity", "0,1,0")
+    refused(line, capsys, "--gravity: is given with the pose of")
 
 
 @pytest.mark.parametrize("options", [("--bag", "{tmp}/a.mcap"), ("--goal", "{tmp}/goal.mcap")])

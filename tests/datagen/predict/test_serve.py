@@ -72,6 +72,34 @@ def test_frames_of_a_session_are_fused_and_bounded(client: TestClient, seen: See
     assert client.delete("/sessions/s5").json() == {"was_there": False}
 
 
+def test_the_latest_frame_that_marks_a_target_decides(client: TestClient, seen: Seen) -> None:
+    here, ahead = seen.camera.T_world_camera[:3, 3], np.array([0.0, 0.0, 0.3])
+    there = seen.turned_to(here + ahead)
+    other = there.frame.body == np.bincount(there.frame.body[there.frame.body > 1]).argmax()
+
+    def asked(body: bytes, **params: Any) -> Any:
+        said = client.post("/base", content=body, params={"session": "hall2", **params})
+        assert said.status_code == 200, said.text
+        return said.json()
+
+    def centre(found: Any) -> Any:
+        return np.array(found["target"]["center_m"])
+
+    first, alone = asked(packed(seen)), client.post("/base", content=packed(there, mask=other)).json()
+    second = asked(packed(there, mask=other))  # not both objects, as one
+    assert (
+        np.linalg.norm(centre(second) - centre(alone)) < 0.02 < np.linalg.norm(centre(second) - centre(first))
+    )
+    # Turned from where the robot is now.
+    np.testing.assert_allclose(second["T_world_camera"][0], there.frame.camera.T_world_camera)
+    client.delete("/sessions/hall2")
+    v, u = (int(np.median(pixels)) for pixels in np.nonzero(seen.frame.body == 1))
+    clicked = asked(packed(seen, mask=None), click=f"{u},{v}")
+    moved_on = asked(packed(there, mask=None))  # a click stays with its frame
+    assert len(moved_on["T_world_camera"]) == 2
+    assert np.linalg.norm(centre(moved_on) - centre(clicked)) < 0.02
+
+
 @pytest.mark.parametrize(
     ("body", "params", "status", "words"),
     [

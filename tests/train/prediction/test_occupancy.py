@@ -14,7 +14,8 @@ from PIL import Image
 from datagen.schemas.errors import InputError
 from datagen.train.prediction import KnownFloor, OccupancyMap, RobotSize, predict, read_map
 from datagen.train.prediction.answer import Prediction
-from datagen.train.prediction.base_cells import STATES
+from datagen.train.prediction.base_cells import STATES, crowded_bases
+from datagen.train.prediction.footprints import Footprint
 from datagen.train.prediction.frames import SensorFrame
 from datagen.train.scorers import ModelScorer
 from datagen.workers.occupancy_map import FREE, OCCUPIED, UNKNOWN
@@ -148,3 +149,22 @@ def test_no_base_stands_where_it_shall_keep_out(table: SensorFrame, scorer: Mode
 def test_a_map_needs_frames_with_poses(table: SensorFrame, scorer: ModelScorer) -> None:
     with pytest.raises(InputError, match="without a pose"):
         of(scorer, replace(table, T_world_camera=None), mapped(FREE, table))
+
+
+@given(st.sampled_from([0.05, 0.03, 0.025, 0.02, 0.01]), st.integers(0, 2**32 - 1))
+def test_a_lone_occupied_cell_under_a_base_blocks_it(resolution_m: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    origin = (*rng.uniform(-0.6, -0.5, 2), float(rng.uniform(-0.2, 0.2)))
+    cells = np.full((round(2 / resolution_m),) * 2, FREE, np.int8)
+    leg = OccupancyMap("legs", cells, resolution_m, origin)
+    middle = tuple(np.floor(_local(leg, np.zeros(2)) / resolution_m).astype(int))
+    cells[middle[::-1]] = OCCUPIED
+    free, occupied = KnownFloor((leg,)).points(np.full(2, -0.4), np.full(2, 0.4))
+    base, around = Footprint(0.25), np.insert(occupied, 2, 0.0, axis=1).astype(np.float32)
+    assert crowded_bases(around, np.zeros((1, 2)), np.zeros(1), base).all()
+    assert len(free) > 100 * len(occupied)
+
+
+def _local(of: OccupancyMap, xy: np.ndarray) -> np.ndarray:
+    (x, y, turn), c, s = of.origin, np.cos(of.origin[2]), np.sin(of.origin[2])
+    return np.array([[c, s], [-s, c]]) @ (xy - [x, y]) if turn else xy - [x, y]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import datagen
 from datagen.schemas.errors import InputError
 from datagen.train.prediction.recordings import read_recording
 from datagen.workers.geometry.transforms import inverse, yaw_pose
@@ -73,8 +74,15 @@ def test_the_world_without_a_map(seen: Seen, tmp_path: Path, dropped: str, world
         if each.topic == "/tf":
             kept = [t for t in each.message.transforms if t.header.frame_id not in (dropped, "map")]
             each.message.transforms = kept
-    recorded = read_recording(write(tmp_path, sent))
+    recorded = read_recording(path := write(tmp_path, sent))
     assert recorded.world == world and recorded.map is None
+    assert [f"poses are in {world}" in note for f in recorded.frames if f.image for note in f.image.notes]
+    asked = {"bag": path, "robot": "fetch", "click": (160, 120)}
+    room = datagen.OccupancyMap("room", np.zeros((9, 9), np.int8), 0.05, (0.0, 0.0, 0.0))
+    with pytest.raises(InputError, match=f"--map: is no map of the frame {world}"):
+        datagen.predict(**asked, map=[room])
+    with pytest.raises(InputError, match=f"--keep-out: is no map of the frame {world}"):
+        datagen.predict(**asked, keep_out=[room])
 
 
 def png(pixels: np.ndarray, kind: str = "PNG") -> bytes:
@@ -185,13 +193,16 @@ def test_one_of_several_topics_is_named(seen: Seen, tmp_path: Path) -> None:
     assert frame.image is not None and np.allclose(frame.image.depth_m, 3)
 
 
-def test_a_rectified_image_has_the_camera_of_p(seen: Seen, tmp_path: Path) -> None:
+@pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
+def test_a_rectified_image_has_the_camera_of_p(seen: Seen, tmp_path: Path, model: str) -> None:
     sent = record(seen)
     for each in sent:
         if each.topic == "/camera/depth/camera_info":
             each.message.d, each.message.k = np.full(5, 0.1), each.message.k * 0.9
+            each.message.distortion_model = model
     (frame,) = read_recording(write(tmp_path, sent)).frames
-    assert frame.image is not None and frame.image.pinhole.fx_px == pytest.approx(seen.frame.camera.fx_px)
+    assert frame.image is not None and not frame.image.notes
+    assert frame.image.pinhole.fx_px == pytest.approx(seen.frame.camera.fx_px)
 
 
 def test_stamps_before_the_image_are_not_taken_for_it(seen: Seen, tmp_path: Path) -> None:
