@@ -180,7 +180,7 @@ class SelfCollision:
 
     Links that are fixed to one another, links on both sides of one joint and the segments of one telescope
     may always touch. Other pairs that touch in most of 300 random configurations (fixed seed) are left out
-    too: their coarse hulls overlap. The last part of the link `deck` is a base as it was given, which is exact:
+    too: their coarse hulls overlap. The last part of the link `deck` is a base as it was given and exact:
     it does not count there.
     """
 
