@@ -65,7 +65,7 @@ def _await_end(jobs: Jobs, job: StoredJob) -> StoredJob:
         if waited_s >= _GIVE_UP_S <= job.silence().total_seconds():
             return job
         line = health_line(job)
-        if line.partition(", heard")[0] != printed.partition(", heard")[0]:
+        if line.partition(", last sign")[0] != printed.partition(", last sign")[0]:
             _print_stderr(f"{job.id}: {line}")
             printed = line
         time.sleep(_POLL_S)

@@ -247,7 +247,6 @@ def predict(given: PredictOptions) -> Prediction:
         KnownFloor,
         RobotSize,
         load_scorer,
-        read_footprint,
         read_map,
         read_place,
     )
@@ -267,8 +266,7 @@ def predict(given: PredictOptions) -> Prediction:
             out=DEMO_PICTURE if given.out is None else given.out,
             html=_demo_page() if given.html is None else given.html,
         )
-    size = (_required(given.base_height, "--base-height"), _required(given.reach, "--reach"))
-    outline = None if given.footprint is None else read_footprint(given.footprint)
+    size, outline = _sizes(given)
     error = None if given.arrival is None else read_arrival(given.arrival)
     direction = None if given.gravity is None else _direction(given.gravity)
     out, html, goal = (None if file is None else Path(file) for file in (given.out, given.html, given.goal))
@@ -340,6 +338,19 @@ def _of_robot(given: PredictOptions, robot: str) -> tuple[PredictOptions, float]
     }
     missing = {name: value for name, value in sizes.items() if getattr(given, name) is None}
     return replace(given, robot=None, **missing), limits.yaw_rad
+
+
+def _sizes(given: PredictOptions) -> tuple[tuple[float, float], Footprint | None]:
+    """Height of the mount and reach (m), and the base where one is given."""
+    from datagen.train.prediction import read_footprint
+
+    size = (_required(given.base_height, "--base-height"), _required(given.reach, "--reach"))
+    return size, None if given.footprint is None else read_footprint(given.footprint)
+
+
+def refuse_robot(given: PredictOptions) -> None:
+    """Raise InputError where `predict` would, whatever the frame: for the robot and its sizes."""
+    _sizes(given if given.robot is None else _of_robot(given, given.robot)[0])
 
 
 def _required(value: T | None, option: str) -> T:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import os
 import re
+import socket
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.commands.predict import predict
+from datagen.commands.predict import PredictOptions, predict, refuse_robot
 from datagen.console.command_lines import options_of
 from datagen.console.options import File
 from datagen.display.progress import Progress
@@ -38,6 +39,7 @@ class ServeOptions:
         robot: Robot, or its file ROBOT.toml, as of `predict`.
         base_height: Height of the arm's mount above the floor (m).
         reach: Reach of the arm from its mount (m).
+        footprint: Base, as of `predict`: radius (m), corners x,y;x,y;... around the mount, or a robot.
         map: Map of the floor, map.yaml; repeatable.
         keep_out: Map of which no base may stand on occupied cells.
         host: Address to listen on.
@@ -51,6 +53,7 @@ class ServeOptions:
     robot: str | None = None
     base_height: float | None = None
     reach: float | None = None
+    footprint: str | None = None
     map: Annotated[Sequence[Path], _UNSET] = ()
     keep_out: Annotated[Sequence[Path], _UNSET] = ()
     host: str = "127.0.0.1"
@@ -70,10 +73,21 @@ def serve(given: ServeOptions) -> None:
     import uvicorn
 
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # of the worker processes
+    if not 1 <= given.port <= 65535:
+        raise InputError("--port", str(given.port), "is not between 1 and 65535", "Choose another")
     app = app_of(given)
-    with Progress() as shown:
+    config = uvicorn.Config(app, log_level="warning", limit_concurrency=64)
+    with Progress() as shown, _listening(given.host, given.port) as bound:
         shown.phase(f"listening on http://{given.host}:{given.port}, described at /docs")
-        uvicorn.run(app, host=given.host, port=given.port, log_level="warning", limit_concurrency=64)
+        uvicorn.Server(config).run([bound])
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        raise InputError("--port", str(port), f"cannot be listened on: {error}", "Choose another") from None
 
 
 def app_of(given: ServeOptions) -> FastAPI:
@@ -98,7 +112,9 @@ def answerer(given: ServeOptions) -> Callable[..., dict[str, Any]]:
     from datagen.train.program_scorer import ProgramScorer
 
     scorer, own_maps = load_scorer(given.checkpoint), [read_map(each) for each in given.map]
-    fixed: dict[str, Any] = {name: getattr(given, name) for name in ("robot", "base_height", "reach")}
+    names = "robot", "base_height", "reach", "footprint"
+    fixed: dict[str, Any] = {name: getattr(given, name) for name in names}
+    refuse_robot(PredictOptions(**fixed))
     fixed |= {"keep_out": [read_map(each) for each in given.keep_out]}
 
     def ask(frames: list[SensorFrame], options: dict[str, Any]) -> Prediction:

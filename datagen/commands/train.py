@@ -14,7 +14,7 @@ from cyclopts import Parameter
 
 from datagen.configuration.toml_files import read_toml
 from datagen.console.command_lines import Interrupted, interruptible, options_of, print_interrupted, prints
-from datagen.console.options import AllowIncomplete, AsJson, File, PathOrAddress, PathsOrAddresses, Whole
+from datagen.console.options import AllowIncomplete, AsJson, File, PathsOrAddresses, Whole
 from datagen.console.printing import print_json, print_rows, seconds, summary_of_stored
 from datagen.released import checkpoint_file
 from datagen.schemas.errors import InputError
@@ -109,7 +109,7 @@ class TrainOptions:
     house_share: float = 1.0
     lr: float | None = None
     seed: Whole = 0
-    encoded: PathOrAddress | None = None
+    encoded: File | None = None
     device: Literal["auto", "cpu", "cuda"] = "auto"
     threads: Whole | None = None
     allow_incomplete: AllowIncomplete = False
@@ -119,6 +119,10 @@ class TrainOptions:
         """Raise InputError for options that do not fit."""
         if not self.runs:
             raise InputError("datagen train", "RUN", "is missing", "Name one or more run folders")
+        for name in ("out", "encoded"):
+            if "://" in str(getattr(self, name) or ""):
+                fix = "Name a place on this machine, and copy it afterwards"
+                raise InputError(f"--{name}", str(getattr(self, name)), "is an address", fix)
         if self.threads is not None and not 1 <= self.threads <= 1024:
             fix = "Give 1 or more, or leave it out"
             raise InputError("datagen train", "--threads", f"{self.threads}", fix)

@@ -57,6 +57,8 @@ def refuse_output(file: Path, option: str, *endings: str) -> None:
     if file.suffix.lower() not in endings:
         valid = " or ".join(endings)
         raise InputError(file, option, f"is not a {valid} file", f"Give a name that ends in {valid}")
+    if str(file).startswith(("s3:/", "gs:/")):
+        raise InputError(file, option, "is an address", "Name a file on this machine, and copy it afterwards")
     if not file.parent.is_dir():
         raise InputError(file, option, "its folder does not exist", "Make the folder first")
 

@@ -20,7 +20,7 @@ from datagen.train.training.checkpoints import load_model, read_checkpoint
 from datagen.train.training.training_setup import choose_device
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
-from tests.small_runs import json_of
+from tests.small_runs import json_of, make_small_run
 from tests.train.conftest import heuristic_run, sim_run
 from tests.train.training.small import TINY, equal
 
@@ -121,6 +121,8 @@ def test_what_cannot_be_trained_is_refused(
         (words("stage1", run, out, "--model-config", "beauty=1"), ("beauty",)),
         (words("stage1", run, out, "--model-config", "none.toml"), ("none.toml",)),
         (words("stage1", run, out, "--threads", "0"), ("--threads",)),
+        (["train", "stage1", str(run), "--out", "s3://b/m.ckpt", *HERE], ("--out", "is an address")),
+        (words("stage1", run, out, "--encoded", "s3://b/inputs"), ("--encoded", "is an address")),
         (words("stage1", run, tmp_path), (str(tmp_path), "not a file")),
     ]
     for arguments, told in cases:
@@ -129,7 +131,7 @@ def test_what_cannot_be_trained_is_refused(
 
 
 def test_another_training_is_not_overwritten(
-    first: Path, heuristic_run: Path, tiny: str, capsys: pytest.CaptureFixture[str]
+    first: Path, heuristic_run: Path, tiny: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     before = first.read_bytes()
     more = ("--model-config", tiny, "--epochs", "2", "--seed", "5")
@@ -137,7 +139,29 @@ def test_another_training_is_not_overwritten(
     assert "seed (0, now 5)" in told
     assert "house_share" not in told
     refused(words("stage1", heuristic_run, Path(more[1]), *more), capsys, "not a datagen checkpoint")
+    # A run more, after one whose digest is longer than what the error shows.
+    other = make_small_run(tmp_path / "other", 64, "--seed", "9")
+    same = "--epochs", "1", "--model-config", tiny
+    refused(
+        ["train", "stage1", str(heuristic_run), str(other), "--out", str(first), *HERE, *same],
+        capsys,
+        "data (",
+    )
     assert first.read_bytes() == before
+
+
+def test_a_model_of_ones_own_is_found_by_the_name_that_was_given(
+    heuristic_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "own_models.py").write_text(
+        "from datagen.train.models.shared import SharedModel\n\n\n"
+        "class Own(SharedModel):\n    name = 'mine'\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("DATAGEN_ALLOW", "own_models:Own")
+    out = tmp_path / "own.ckpt"
+    assert cli.run(words("stage1", heuristic_run, out, "--epochs", "1", "--model", "own_models:Own")) == 0
+    assert type(load_model(out)[0]).__name__ == "Own"
 
 
 def test_ctrl_c_loses_nothing(heuristic_run: Path, tiny: str, tmp_path: Path):

@@ -228,10 +228,10 @@ def _model(job: TrainingJob, began: Checkpoint | None) -> Model:
     model = build_model(options.model, options.model_config)
     if began is not None:
         other, weights = began.head, began.weights
-        if other.model == model.name and model.config == {**other.model_config, "kinematics": True}:
+        if other.model == options.model and model.config == {**other.model_config, "kinematics": True}:
             weights = with_reach(weights)
-        elif (other.model, other.model_config) != (model.name, model.config):
-            problem = f"is {other.model} {other.model_config}, not {model.name} {model.config}"
+        elif (other.model, other.model_config) != (options.model, model.config):
+            problem = f"is {other.model} {other.model_config}, not {options.model} {model.config}"
             fix = "Omit --model and --model-config; kinematics=true may be added"
             raise InputError(str(job.init), "model", problem, fix)
         put_weights(model, weights, str(job.init))
@@ -247,7 +247,7 @@ def _head(
     object_digests = train.object_digests().union(began.object_digests if began else ())
     val_house_ids = val.house_ids().union(began.val_house_ids if began else ()) - house_ids
     return CheckpointHead(
-        model=model.name,
+        model=job.options.model,
         model_config=model.config,
         stage=job.options.stage,
         options=job.options.document(),
@@ -268,7 +268,7 @@ def refuse_other_training(place: str, stored: CheckpointHead, requested: Checkpo
     theirs, ours = _decisive(stored), _decisive(requested)
     names = [name for name in {**ours, **theirs} if ours.get(name) != theirs.get(name)]
     if names:
-        shown = [f"{name} ({theirs.get(name)}, now {ours.get(name)})" for name in names[:4]]
+        shown = [f"{name} ({theirs.get(name)!s:.60}, now {ours.get(name)!s:.60})" for name in names[:4]]
         more = f" and {len(names) - 4} more" if len(names) > 4 else ""
         problem = f"holds another training: {', '.join(shown)}{more} differ"
         raise InputError(
@@ -285,4 +285,4 @@ def _decisive(head: CheckpointHead) -> dict[str, str]:
         "val_data": [r["samples_sha256"] for r in head.val_data],
     }
     fields |= {"init": head.init["digest"] if head.init else None}
-    return {name: f"{value!s:.60}" for name, value in fields.items()}
+    return {name: str(value) for name, value in fields.items()}

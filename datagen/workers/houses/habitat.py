@@ -118,7 +118,7 @@ class HabitatHouses:
     carrying: frozenset[str] = CARRYING_TYPES | {"Object"}  # types whose flat tops support objects
     statement: Mapping[str, str] = field(default_factory=dict)
     kind: str = "habitat"
-    _templates: OrderedDict[Path, _Template] = field(default_factory=OrderedDict)
+    _templates: OrderedDict[tuple[object, ...], _Template] = field(default_factory=OrderedDict)
 
     def house_ids(self) -> list[str]:
         """Ids, sorted: the scene's path below the root, or the folder of scenes, without its ending."""
@@ -192,12 +192,12 @@ class HabitatHouses:
         return found, findings
 
     def _template(self, files: AssetFiles, *, is_stage: bool = False) -> _Template:
-        file = files.mesh
-        if file in self._templates:
-            self._templates.move_to_end(file)
-            return self._templates[file]
+        key = files.mesh, files.collision, files.scale, is_stage
+        if key in self._templates:
+            self._templates.move_to_end(key)
+            return self._templates[key]
         S = np.diag([*files.scale, 1.0])
-        mesh, digest = read_glb(file).transformed(_Y_UP_TO_WORLD @ S), file_digest(file)
+        mesh, digest = read_glb(files.mesh).transformed(_Y_UP_TO_WORLD @ S), file_digest(files.mesh)
         solid = mesh
         if files.collision is not None:
             solid = read_glb(files.collision).transformed(_Y_UP_TO_WORLD @ S)
@@ -205,7 +205,7 @@ class HabitatHouses:
         if files.scale != (1.0, 1.0, 1.0):
             digest = hashlib.sha256(digest + S.tobytes()).digest()
         template = _Template(mesh, () if is_stage else convex_parts(solid), digest)
-        self._templates[file] = template
+        self._templates[key] = template
         if len(self._templates) > _KEPT_MESHES:
             self._templates.popitem(last=False)
         return template

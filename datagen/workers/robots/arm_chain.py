@@ -55,11 +55,11 @@ class ArmChain:
         if own_hand and palm == self.names[-1]:  # the hand's bodies hold what the last joint moves
             self.clusters[-1] = last = {palm: (Link(palm, None, (), ()), np.eye(4))}
             self.names[-1] += "-tip"
+        self.T_tip_palm = self._tip_palm(source, palm)
         at_palm = above is not None and palm == keys.arm.tip
         self.T_tip = (
             last[above.parent][1] @ above.T_parent_child if at_palm and above else last[keys.arm.tip][1]
         )
-        self.T_tip_palm = self._tip_palm(source, palm)
         self._coordinates(source)
 
     def _tip_palm(self, source: RobotSource, palm: str) -> F64:
@@ -147,7 +147,8 @@ class ArmChain:
         for joint in self._joints:
             k = len(found)
             T = scaled_pose(self.clusters[k][joint.parent][1] @ joint.T_parent_child, scale)
-            lower, upper = self.tree.limits(self.tree.driver(joint)[0])
+            driver, ratio, offset = self.tree.driver(joint)
+            lower, upper = sorted(ratio * limit + offset for limit in self.tree.limits(driver))
             kind = "prismatic" if joint.kind == "prismatic" else "revolute"
             child = self.names[k + 1]
             found.append(

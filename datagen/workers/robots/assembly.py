@@ -134,8 +134,9 @@ def assemble(source: RobotSource, reach_m: float | None) -> Assembly:
     scale, tube_m = 1.0, 0.0
     if keys.scaled is not None and reach_m is not None:
         rule = keys.scaled
-        share = (rule.no_tube_from_m - reach_m) / (rule.no_tube_from_m - rule.reach_m[0])
-        tube_m = rule.tube_m * min(max(share, 0.0), 1.0)
+        if reach_m < rule.no_tube_from_m:
+            share = (rule.no_tube_from_m - reach_m) / (rule.no_tube_from_m - rule.reach_m[0])
+            tube_m = rule.tube_m * min(share, 1.0)
         scale = arm.scale_for(hand, tube_m, reach_m)
     joints, T_palm = arm.joints(scale), arm.palm(scale, tube_m)
     cuts = keys.arm.cuts_m

@@ -111,7 +111,7 @@ class TrialWorld:
         tune_body(self._arm)
         joints = self._arm.get_active_joints()
         columns = {joint.name: k for k, joint in enumerate(joints)}
-        self._columns = np.array([columns[body.joint] for body in bodies[1:]])
+        self._columns = np.array([columns[str(k)] for k in range(1, len(bodies))])
         self._coordinates = robot.coordinates
         self._joints = [joints[k] for k in self._columns]
         self._fingers = links[-2:]
@@ -283,7 +283,7 @@ def _robot_links(
         if body.parent < 0:
             joint.type = "fixed"
         else:
-            joint.name, joint.type = body.joint, body.kind
+            joint.name, joint.type = str(k), body.kind  # arm and hand may share names
             joint.set_pose_in_parent(sapien_pose(body.T_parent_joint))
             joint.set_pose_in_child(sapien_pose(body.T_body_joint))
             joint.set_limits([[body.lower, body.upper]])

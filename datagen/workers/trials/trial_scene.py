@@ -65,6 +65,8 @@ def articulation_of(robot: Robot, opening_m: float = 0.0) -> tuple[MovingBody, .
             bodies.append(_sliding_finger(robot, parts, side, count, T_last_tcp, fingers))
         return tuple(bodies)
     for body, joint in zip(fingers, assembly.hand.joints, strict=True):
+        if joint.upper <= joint.lower:  # the URDF has no range, or that of a driver: the file has
+            joint = replace(joint, lower=0.0, upper=robot.gripper.max_opening_m / 2)
         bodies.append(_body([(body, np.eye(4))], count, joint, T_palm @ _rounded(joint.T_parent_child)))
     return tuple(bodies)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -156,6 +157,37 @@ def test_the_service_goes_on_after_a_worker_was_killed(seen: Seen) -> None:
         assert statuses[-1] == 200
     left = set(psutil.Process().children(recursive=True)) - before
     assert not any("spawn_main" in " ".join(each.cmdline()) for each in left if each.is_running())
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ((), "--base-height: is missing"),
+        (("--robot", "fetchh"), "fetchh: is unknown"),
+        (("--base-height", "-1", "--reach", "0.9"), "--base-height"),
+        (("--robot", "fetch", "--footprint", "x"), "footprint"),
+        (("--robot", "fetch", "--port", "99999"), "--port: 99999: is not between 1 and 65535"),
+        (("--robot", "fetch", "--port", "{taken}"), "cannot be listened on"),
+    ],
+)
+def test_what_cannot_be_served_is_refused_at_the_start(
+    options: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = other.getsockname()[1]
+        said = refused(["serve", *(each.format(taken=taken) for each in options)], capsys, words)
+    assert "listening" not in said
+
+
+def test_a_base_decides_what_is_clear(seen: Seen) -> None:
+    low = camera_arrays(seen)[3][:2, 3] - 6.0
+    room = {"map": np.zeros((240, 240), np.int8), "map_pose": np.array([*low, 0.0, 0.05])}
+    asked = {"content": packed(seen, **room), "params": {"candidates": True}}
+    clear = []
+    for footprint in ("0.2", "0.45"):
+        answer = TestClient(app_of(ServeOptions(**SIZES, footprint=footprint))).post("/base", **asked).json()
+        clear.append(sum(each["state"] == "clear" for each in answer["candidates"]))
+    assert clear[0] > clear[1] > 0
 
 
 def test_a_large_body_is_refused(client: TestClient, seen: Seen, monkeypatch: pytest.MonkeyPatch) -> None:

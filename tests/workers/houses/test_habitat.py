@@ -211,6 +211,22 @@ def test_any_pose_and_scale_places_the_mesh(
     np.testing.assert_allclose(parts.max(0), expected.max(0), atol=5e-3)
 
 
+def test_a_mesh_of_two_sizes_is_of_its_own_size_whatever_was_loaded_before(tmp_path: Path) -> None:
+    root = write_replicacad(tmp_path)
+    scene = json.loads((root / "configs/scenes/apt_0.scene_instance.json").read_text())
+    table, low = "frl_apartment_table_01", "frl_apartment_table_low"
+    config = {"render_asset": f"../../objects/{table}.glb", "scale": [1.0, 0.6, 1.0]}
+    write(root / f"configs/objects/{low}.object_config.json", config)
+    scene["object_instances"] = [placed(f"objects/{low}", (2.5, 0.0, 3.0), (1.0, 0.0, 0.0, 0.0))]
+    write(root / "configs/scenes/apt_1.scene_instance.json", scene)
+    alone, after = open_houses(f"habitat:{root}"), open_houses(f"habitat:{root}")
+    first, second = alone.house_ids()
+    before = alone.load(second)
+    after.load(first)
+    assert after.load(second).digest == before.digest
+    assert [s.height_m for s in before.surfaces] == pytest.approx([0.444], abs=1e-3)
+
+
 def replace_glb(path: Path, **more: Any) -> None:
     """Add members to the description of a GLB file."""
     data = path.read_bytes()

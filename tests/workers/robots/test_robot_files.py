@@ -13,6 +13,7 @@ pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run 
 
 from datagen import cli
 from datagen.schemas.errors import InputError
+from datagen.schemas.specification import TrialParams
 from datagen.workers.robots import (
     open_robot,
     remember,
@@ -150,6 +151,48 @@ def test_a_mimic_of_a_mimic_follows_the_driver(tmp_path: Path) -> None:
     assert (joint.name, ratio, offset) == ("a", -6.0, -0.5)  # c = 1 - 3 b, b = 0.5 + 2 a
 
 
+def test_a_mimic_joint_of_the_arm_has_the_range_that_its_driver_gives_it(make: Made) -> None:
+    elbow = LIMIT.format(-2.5, 2.5)
+    robot = open_robot(
+        make(urdf=(elbow, f'{elbow}<mimic joint="tilt" multiplier="-1" offset="0.2"/>')), None, 0.85
+    )
+    assert robot.joint_names == ("lift", "pan", "tilt", "roll")
+    joint = next(each for each in robot.assembly.arm if each.name == "elbow")
+    assert (joint.lower, joint.upper) == pytest.approx((-1.3, 1.7))
+
+
+HAND = "".join(f'<link name="{k}"><collision><geometry>{LINKS[k].partition("@")[0]}</geometry></collision></link>'
+               for k in ("palm", "left", "right")) + "".join(
+    f'<joint name="{name}" type="prismatic"><parent link="palm"/><child link="{child}"/><origin xyz="0.1 {y} 0"/>'
+    f'<axis xyz="0 {side} 0"/><limit velocity="1" effort="10"/></joint>'
+    for name, child, y, side in (("pan", "left", 0.006, 1), ("elbow", "right", -0.006, -1))
+)  # fmt: skip
+
+
+def test_fingers_without_limits_and_with_names_of_the_arm_move_in_physics(make: Made) -> None:
+    pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
+    from datagen.workers.trials.physics import TrialWorld
+    from datagen.workers.trials.trial_scene import TrialScene, articulation_of
+
+    ranges = "[hand.range]\npan = [0.0, 0.04]\nelbow = [0.0, 0.04]\n"
+    name = make(
+        ('tip = "palm"', 'tip = "wrist"'), more=f'[hand]\nurdf = "hand.urdf"\npalm = "palm"\n{ranges}'
+    )
+    Path(name).with_name("hand.urdf").write_text(f"<robot name='h'>{HAND}</robot>")
+    robot = open_robot(name, None, 0.85)
+    none = np.zeros((0, 3))
+    things = (), none, none, (), np.zeros(0), np.zeros((0, 4, 4))
+    scene = TrialScene(robot, articulation_of(robot), TrialParams(), 0.3, *things)
+    world = TrialWorld(scene, np.eye(4), 0.03, 0.6)
+    q = np.array([0.1, 0.2, -0.3, 0.4, 0.5])
+    world.place_arm(q, 0.03)
+    np.testing.assert_allclose(world.joints, [*q, 0.015, 0.015], atol=1e-5)
+    low, high = np.array([joint.get_limits()[0] for joint in world._joints]).T
+    np.testing.assert_allclose(
+        (low[-2:], high[-2:]), ([0, 0], [robot.gripper.max_opening_m / 2] * 2), atol=1e-6
+    )
+
+
 def test_a_torso_is_held_where_the_file_says_so(make: Made) -> None:
     with pytest.raises(InputError, match=r"robot\.toml: arm: 3 joints move: pan, tilt, roll; 4 to 9 may"):
         robot_limits(make(more="[arm.held]\nlift = 0.3\nelbow = 0.1\n"))
@@ -209,6 +252,7 @@ def test_a_digest_depends_on_content_and_not_on_the_place(make: Made) -> None:
         (("", ""), ("", ""), "[base]\npedestal = true\nradius_m = 0.3\n", r"excludes"),
         (('"base"\n', '"base"\ntucked = [[0.0, 0.0]]\n'), ("", ""), "", r"arm\.tucked: has rows of 2"),
         (('"base"\n', '"base"\nignore = ["gone"]\n'), ("", ""), "", r"arm\.ignore: link gone"),
+        (("", ""), ("", ""), '[hand]\npalm = "lower"\n', r"link lower: is not below link palm"),
         (('urdf =', 'reach_m = 0.5\nurdf ='), ("", ""), "", r"reach_m: is 0\.5 m, and the URDF's arm has"),
     ],
 )  # fmt: skip
