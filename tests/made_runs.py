@@ -193,6 +193,15 @@ def values_of(schema: RecordSchema, f: Field, rows: int, rng: np.random.Generato
     return rng.integers(int(low), int(min(high, np.iinfo(dtype).max, 10**6)) + 1, shape).astype(dtype)
 
 
+def lose(run: Path, *shards: int) -> None:
+    """As if these shards had never been made."""
+    for shard in shards:
+        object_of(run, shard).unlink()
+        (run / f"commits/{shard:06d}.json").unlink()
+        for file in run.glob(f"ledger/{shard:06d}-*"):
+            file.unlink()
+
+
 def give_up(
     run: Run, shard: int, *causes: str, attempts: tuple[str, ...] = ("a",), stack: str = "", at: str = ""
 ) -> None:

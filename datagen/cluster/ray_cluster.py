@@ -59,7 +59,7 @@ class RaySettings:
     """Address and size of a cluster."""
 
     address: str = "local"  # or `auto`, `HOST:PORT` of a running cluster
-    workers: int | None = None  # slots of a local cluster; None: one per core
+    workers: int | None = None  # slots of a local cluster, most of a running one; None: one per core
     attempts_per_worker: int = 200  # then a new process, because of memory leaks
     task_memory_bytes: int = 0  # that an attempt requests of a running cluster
     # Gets lines about machines of a running cluster: those that are left out, and none being free.

@@ -242,7 +242,7 @@ class RayExecutor(Generic[T]):
             if node["Alive"] and node["NodeID"] not in self._left_out:
                 has = node["Resources"]
                 slots += int(min(has.get("CPU", 0), has.get("memory", 0) // bytes_each))
-        return slots
+        return slots if self._settings.workers is None else min(slots, self._settings.workers)
 
     def _failure_reports(self, deaths: list[_Death[T]]) -> list[AttemptReport]:
         """Reports of dead attempts from their files here; other machines are asked for the rest."""

@@ -12,6 +12,7 @@ from datagen.console.command_lines import absolute_path, command_line, prints, r
 from datagen.console.options import AsJson, PathOrAddress
 from datagen.console.printing import print_json, print_rows, summary_of_stored
 from datagen.display.progress import steps
+from datagen.jobs.job_report import readable_by
 from datagen.schemas.merging import MergePlan, MergeResult, WrittenPart, merge_runs, plan_merge
 from datagen.schemas.run import Run, label_counts, open_runs
 
@@ -34,7 +35,7 @@ def _print_rows(report: dict[str, Any]) -> None:
     out = report["out"]
     rows = [
         ("labels", f"{report['labels']:,} of {report['n']:,}{state}"),
-        ("store", f"{report['sealed']}: zarr.open or xarray.open_zarr reads it" if report["sealed"] else "-"),
+        ("store", readable_by(report["sealed"]) if report["sealed"] else "-"),
     ]
     if missing:
         rows.append(("resume with", command_line(["resume", out])))

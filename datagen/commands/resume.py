@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -82,8 +81,9 @@ def resume(options: ResumeOptions) -> JobResult:
             _extend(job_runs, options.n, path)
         if options.quarantined:
             lifted = sum(len(lift_quarantine(job_run.run)) for job_run in job_runs)
-            if not options.quiet:
-                sys.stderr.write(f"out of quarantine: {counted(lifted, 'shard')}\n")
+            with options.display() as shown:
+                shards = counted(lifted, "shard")
+                shown.say("out_of_quarantine", {"shards": lifted}, f"out of quarantine: {shards}")
     if options.detach:
         return detach_job(again, path)
     return Job(storage, path, job_runs, options, began_s, words, again).run()

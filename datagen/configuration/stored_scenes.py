@@ -144,7 +144,7 @@ def refuse_too_few(stored: StoredScenes, layout: Layout, n: int) -> None:
             "--n",
             str(n),
             f"is more than the {shards * layout.samples_per_shard:,} candidates of {stored.run.storage.url}",
-            "Ask for fewer labels, or extend that run first",
+            f"Ask for fewer labels, or extend that run first: {stored.run.command_for_missing}",
         )
 
 

@@ -150,7 +150,8 @@ def open_source(run: str, scenes: str | None, given: AssetSources) -> ExportSour
     counts = label_counts(runs)
     if counts.labels < counts.n:
         problem = f"{counts.n - counts.labels:,} of the {counts.n:,} planned samples are missing"
-        raise InputError(run, "commits", problem, f"Make them with `datagen resume {run}`")
+        lacking = next((each for each in runs if each.quarantined()), runs[0])
+        raise InputError(run, "commits", problem, f"Make them: {lacking.command_for_missing}")
     total = sum(len(each.counted(each.n)) for each in runs)
     if scenes is None:
         return ExportSource(run, runs, 0, total, given)

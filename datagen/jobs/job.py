@@ -59,7 +59,7 @@ class JobOptions:
 
     workers: Annotated[
         Whole | None,
-        option("Worker processes; 0: this process, for debuggers. [default: one per core]", RUNNING),
+        option("Most worker processes; 0: this process, for debuggers. [default: one per core]", RUNNING),
     ] = None
     address: Annotated[str, option("local, or the address of a Ray cluster.", RUNNING)] = "local"
     detach: Annotated[bool, option(_DETACH, RUNNING)] = False
@@ -74,6 +74,9 @@ class JobOptions:
         if self.workers is not None and not 0 <= self.workers <= 4096:
             fix = "Omit it for one per core"
             raise InputError("--workers", str(self.workers), "is not between 0 and 4096", fix)
+        if self.workers == 0 and self.address != "local":
+            fix = "Omit one of them: 0 workers is this process"
+            raise InputError("--workers", "0", f"is given with --address {self.address}", fix)
         if self.workers != 0:
             refuse_missing("cluster", "or work in this process: --workers 0")
             refuse_unusable(self.address)
@@ -222,7 +225,9 @@ class Job:
             return InProcessExecutor(run_attempt)
         shown.phase("starting Ray")
         cores = len(os.sched_getaffinity(0))
-        workers = min(self.options.workers or cores, shards)  # Ray starts them all at once
+        workers = self.options.workers
+        if self.options.address == "local":
+            workers = min(workers or cores, shards)  # Ray starts them all at once
         has_arm = any(each.run.manifest.spec.arm for each in self.runs)
         settings = RaySettings(
             address=self.options.address,

@@ -71,6 +71,12 @@ def job_report(job: StoredJob) -> dict[str, Any]:
     }
 
 
+def readable_by(store: str) -> str:
+    """A sealed store and what reads it; other libraries need their own clients and keys for S3."""
+    readers = "datagen.open_dataset" if "://" in store else "zarr.open or xarray.open_zarr"
+    return f"{store}: {readers} reads it"
+
+
 def health_line(job: StoredJob) -> str:
     """One line on a job: state, progress, host and process."""
     record, state, health = job.record, job.state, job.health()
@@ -151,7 +157,7 @@ def _print(result: JobResult) -> None:
         those = f"{counted(len(result.quarantined), 'shard')} ({listed(result.quarantined)})"
         rows.append(("quarantined", f"{those}; try again: {again}"))
     if result.store:
-        rows.append(("store", f"{result.store}: zarr.open or xarray.open_zarr reads it"))
+        rows.append(("store", readable_by(result.store)))
     print_rows(f"{result.end}: {path}", rows)
     print_lines(result.doubt)
 

@@ -22,6 +22,7 @@ from datagen.display.progress import Progress
 from datagen.jobs.job_report import JobResult
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import sample_ids
+from datagen.schemas.quarantine import lift_quarantine
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import StageClock
 from datagen.schemas.sealing import seal
@@ -76,6 +77,7 @@ def relabel_run(storage: Storage, source: Run, spec: Specification, json: bool =
     if not source.committed():
         raise InputError(source.storage.url, "commits", "no shard is committed", "Resume the run first")
     run, stop = _open_target(storage, source, spec), StopRequest()
+    lift_quarantine(run)  # a job may have tried shards that the source lacked then
     planned = run.missing()
     missing = planned.within(ShardRanges.of(source.committed()))
     with stop_on_signals(stop, interrupt=True), Progress(json) as shown:

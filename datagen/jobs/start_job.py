@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from datagen.configuration.robot_fields import refuse_missing_packages
+from datagen.configuration.stored_scenes import StoredScenes, refuse_too_few
 from datagen.console.command_lines import (
     absolute_path,
     absolute_robot,
@@ -69,13 +70,12 @@ def open_job_run(run: Run, given: Sources) -> JobRun:
     open_sources(run, given)
     refuse_unusable_engines(spec)
     houses, objects, robot = places_of(run, given)
-    return JobRun(
-        run,
-        absolute_source(houses),
-        absolute_source(objects),
-        "" if spec.scenes_from is None else absolute_path(given.scenes_from or known["scenes_from"]),
-        absolute_robot(robot),
-    )
+    scenes_from = ""
+    if spec.scenes_from is not None:
+        scenes_from = absolute_path(given.scenes_from or known["scenes_from"])
+        if run.missing():
+            refuse_too_few(StoredScenes(Run.open(scenes_from), houses, objects), run.layout, run.n)
+    return JobRun(run, absolute_source(houses), absolute_source(objects), scenes_from, absolute_robot(robot))
 
 
 def refuse_unusable_engines(spec: Specification) -> None:

@@ -58,7 +58,7 @@ def _source(
         "other": useful.core_s - fsum(stages.values()),
         "waste": wasted.core_s,
         "scenes of other runs": scenes_s or 0.0,
-        "relabelled files": useful.relabelled_s,
+        "relabelled files": useful.relabelled_s - _counted_twice_s([each.run for each in labels]),
     }
     total = fsum(cost.values())
     counts = {
@@ -92,6 +92,14 @@ def _source(
     }
 
 
+def _counted_twice_s(group: Sequence[Run]) -> float:
+    """Core seconds of files that were relabelled where the run that made them is in the group too."""
+    made = {run.manifest.spec_hash for run in group}
+    stored = ((run, run.manifest.spec.scenes_from) for run in group)
+    again = (run for run, of in stored if of is not None and of.spec_hash in made)
+    return fsum(account_for([run]).useful.relabelled_s for run in again)
+
+
 def _scenes_s(group: Sequence[Labels], runs: Sequence[Run]) -> float | None:
     """Core seconds of the scenes that others of the runs made for these; None where no run made them."""
     total = 0.0
@@ -104,6 +112,8 @@ def _scenes_s(group: Sequence[Labels], runs: Sequence[Run]) -> float | None:
         made_by = [other for other in runs if other.manifest.spec_hash == stored.spec_hash]
         if not made_by:
             return None
+        if any(each.run is made_by[0] for each in group):
+            continue  # counted with its own labels
         maker = account_for(made_by[:1])
         made_s = fsum(maker.useful.stage_s[stage] for stage in _SCENE_STAGES)
         total += made_s * spending.scenes / maker.scenes if maker.scenes else 0.0

@@ -306,6 +306,12 @@ class Run:
         found = self.numbers("quarantine")
         return found - self.committed() if found else found
 
+    @property
+    def command_for_missing(self) -> str:
+        """The command that makes the shards that are missing."""
+        more = " --quarantined" if self.quarantined() else ""
+        return f"datagen resume {self.storage.url}{more}"
+
     def quarantine_records(self) -> list[QuarantineRecord]:
         keys = [f"quarantine/{shard:06d}.json" for shard in sorted(self.quarantined())]
         return list(read_records(self.storage, keys, QuarantineRecord))

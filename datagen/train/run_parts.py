@@ -136,7 +136,7 @@ def _open_run(run: Run, merged: str, names: Sequence[str], allow_incomplete: boo
     missing = wanted - sum(place.samples for place in shards)
     if missing and not allow_incomplete:
         problem = f"{missing:,} of the {wanted:,} planned samples are missing"
-        fix = f"Make them with `datagen resume {url}`, or allow an incomplete run where that is an option"
+        fix = f"Make them: {run.command_for_missing}; or allow an incomplete run where that is an option"
         raise InputError(url, "commits", problem, fix)
     if not shards:
         return None

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from datagen import cli
+from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import commit_key, encode_record
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_shard
 from datagen.train.run_parts import open_parts
 from tests.datagen.forged import forge
-from tests.made_runs import flip, object_of
+from tests.made_runs import flip, give_up, lose, object_of
 from tests.refusals import refused
 from tests.small_runs import HERE, PER_SCENE, arrays_of, assert_equal_runs, files_of, json_of, make_small_run
 from tests.train.conftest import sim_run
@@ -175,6 +176,16 @@ def test_what_cannot_be_done_is_refused_before_anything_is_written(
     assert not (tmp_path / "run").exists()
 
 
+def test_an_audit_of_both_counts_each_second_once(
+    source: Path, relabelled: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spent = 0.0
+    for path in (source, relabelled):
+        spent += sum(commit.cost.cpu_s for commit in Run.open(path).commits())
+    (both,) = json_of(capsys, ["audit", str(source), str(relabelled)])["sources"]
+    assert both["total_core_s"] == pytest.approx(spent, rel=0.01)
+
+
 def test_it_is_not_written_over_something_else(
     source: Path, relabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -199,6 +210,47 @@ def test_a_damaged_shard_is_given_up_and_the_others_are_labelled(
     run = Run.open(out)
     assert run.committed() == set(range(SCENES)) - {3} and run.quarantined() == {3}
     assert "another sha256" in run.quarantine_records()[0].causes[-1]
+
+
+def test_a_run_whose_source_lacks_shards_grows_with_it(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    part, out = tmp_path / "part", tmp_path / "run"
+    shutil.copytree(source, part)
+    lose(part, 4, 5)
+    assert cli.run(["relabel", str(part), "--out", str(out), *RULE]) == 0
+    refused(["resume", str(out), *HERE], capsys, f"candidates of {part}", f"datagen resume {part}")
+    give_up(Run.open(out), 4, "failed: an older version tried it")
+    for shard in (4, 5):
+        for name in ("commits", "shards"):
+            for file in (source / name).glob(f"*{shard:06d}*"):
+                shutil.copy(file, part / name / file.name)
+    assert cli.run(["relabel", str(part), "--out", str(out), *RULE]) == 0
+    assert Run.open(out).committed() == set(range(SCENES)) and not Run.open(out).quarantined()
+
+
+def test_what_is_quarantined_is_made_by_the_command_that_is_named(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    part = tmp_path / "part"
+    shutil.copytree(source, part)
+    lose(part, 2)
+    give_up(Run.open(part), 2, "failed: no luck")
+    named = f"datagen resume {part} --quarantined"
+    refused(["export", str(part), "--to", "parquet", "--out", str(tmp_path / "parquet")], capsys, named)
+    again = [
+        "submit",
+        "heuristic",
+        "--scenes-from",
+        str(part),
+        "--n",
+        str(N),
+        "--out",
+        str(tmp_path / "again"),
+    ]
+    refused([*again, *HERE], capsys, named)
+    with pytest.raises(InputError, match="--quarantined"):
+        open_parts([str(part)], ["label"])
 
 
 def test_labels_of_another_version_of_the_code_are_not_mixed(

@@ -18,7 +18,7 @@ from datagen.schemas.quarantine import lifted_records
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import Manifest
-from tests.made_runs import give_up, object_of
+from tests.made_runs import give_up, lose
 from tests.refusals import refused
 from tests.small_runs import (
     HERE,
@@ -39,15 +39,6 @@ IN_PROCESS = JobOptions(workers=0, quiet=True)
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eight shards. Tests only read it."""
     return make_small_run(tmp_path_factory.mktemp("finished") / "run", N)
-
-
-def lose(run: Path, *shards: int) -> None:
-    """As if these shards had never been made."""
-    for shard in shards:
-        object_of(run, shard).unlink()
-        (run / f"commits/{shard:06d}.json").unlink()
-        for file in run.glob(f"ledger/{shard:06d}-*"):
-            file.unlink()
 
 
 def test_missing_shards_are_made_and_committed_ones_stay(finished: Path, copied: Path) -> None:

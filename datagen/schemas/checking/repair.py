@@ -196,6 +196,9 @@ def refuse_running(storage: Storage) -> None:
         if health == "live" or (health == "silent" and job.silence() < _DEAD_AFTER):
             problem = f"is running on {job.record.host}"
             fix = "Wait until it has ended, or stop it with `datagen cancel`"
+            if health == "silent":
+                problem += f", or was: it gave no sign for {job.silence().total_seconds() / 60:.0f} min"
+                fix = f"If that machine is gone, remove jobs/{name}.json there: no label depends on it"
             raise InputError(storage.url, f"job {name}", problem, fix)
 
 

@@ -161,12 +161,14 @@ def test_a_mimic_joint_of_the_arm_has_the_range_that_its_driver_gives_it(make: M
     assert (joint.lower, joint.upper) == pytest.approx((-1.3, 1.7))
 
 
-HAND = "".join(f'<link name="{k}"><collision><geometry>{LINKS[k].partition("@")[0]}</geometry></collision></link>'
-               for k in ("palm", "left", "right")) + "".join(
-    f'<joint name="{name}" type="prismatic"><parent link="palm"/><child link="{child}"/><origin xyz="0.1 {y} 0"/>'
-    f'<axis xyz="0 {side} 0"/><limit velocity="1" effort="10"/></joint>'
+HAND = "".join(
+    f'<link name="{name}"><collision><geometry>{LINKS[name].partition("@")[0]}</geometry></collision></link>'
+    for name in ("palm", "left", "right")
+) + "".join(
+    f'<joint name="{name}" type="prismatic"><parent link="palm"/><child link="{child}"/>'
+    f'<origin xyz="0.1 {y} 0"/><axis xyz="0 {side} 0"/><limit velocity="1" effort="10"/></joint>'
     for name, child, y, side in (("pan", "left", 0.006, 1), ("elbow", "right", -0.006, -1))
-)  # fmt: skip
+)
 
 
 def test_fingers_without_limits_and_with_names_of_the_arm_move_in_physics(make: Made) -> None:
