@@ -120,9 +120,10 @@ def main() -> None:
             file.parent.mkdir(parents=True, exist_ok=True)
             with file.open("wb") as drawn:
                 draw_prediction(answers[names[0], _MAPPED], drawn)
-    print(f"{asked - refused} scenes, percent of them; {refused} more frames are refused. 95% by scene.\n")
+    print(f"{asked} scenes, percent of them; frames of {refused} are refused. 95% by scene.\n")
     print("| floor | method | answered | good |\n| --- | --- | --- | --- |")
     for (name, setting), found in sorted(good.items(), key=lambda row: (row[0][1], names.index(row[0][0]))):
+        found += [None] * refused
         answered = 100 * np.mean([each is not None for each in found])
         rate = np.array([bool(each) for each in found])
         drawn = np.random.default_rng(_SEED).choice(rate, (2000, len(rate))).mean(axis=1)

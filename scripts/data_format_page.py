@@ -46,8 +46,8 @@ Attributes of arrays: `units` (SI), `long_name`, `frame`, `valid_min`, `valid_ma
 ## A run
 
 Run format {FORMAT_VERSION}. A run is a folder (or an object-store prefix). A shard's object counts only once
-its commit exists. Shards hold whole scenes and are equally long; `data.zarr` is cut to n samples, that of merged
-runs at its end alone ([how a run is stored](../explanation/runs.md)).
+its commit exists. Shards hold whole scenes and are equally long; `data.zarr` is cut to n samples, that of
+merged runs at its end alone ([how a run is stored](../explanation/runs.md)).
 
 ```
 RUN/

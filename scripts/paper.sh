@@ -67,7 +67,7 @@ made_after() {
 }
 
 # 1. Objects: four fifths to train on, and every fifth, which only the test runs have.
-datagen assets split "$ASSETS/ycb" "$OUT/objects"
+datagen assets split "$YCB" "$OUT/objects"
 
 # 2. Labels: the paper's rule, which is cheap, and trials, which are not. No house is in two splits.
 SOME=(--candidates-per-scene "$PER_SCENE" --config "$OUT/tops.toml") # the paper's scenes: open tops alone

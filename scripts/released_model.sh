@@ -34,7 +34,7 @@ submit() { # NAME ROBOT LABELS SPLIT SEED [OPTION...]
 }
 mixes=() views=()
 
-[ -f objects/test/objects.json ] || datagen assets split "$ASSETS/ycb" objects
+[ -d objects/test ] || datagen assets split "$YCB" objects
 printf '[scene]\nplaces = {}\n' > tops.toml
 printf '[scene]\ndecisive = 0.8\n' > decisive.toml
 submit val panda-scaled "$VAL" val 402
@@ -50,7 +50,7 @@ step "training, and beside it the benchmark's runs (runs.log)"
 # Training has one thread, since its bits depend on their number; workers leave it a core, as they are nicer, and take
 # both when it is done. Jobs in the background do not hear Ctrl-C.
 trap 'kill $(jobs -p) 2> /dev/null || true' EXIT
-"$BIN/datagen" benchmark make --houses "procthor:$ASSETS/procthor" --objects "ycb:$ASSETS/ycb" --out runs > runs.log 2>&1 &
+"$BIN/datagen" benchmark make --houses "procthor:$ASSETS/procthor" --objects "ycb:$YCB" --out runs > runs.log 2>&1 &
 datagen train sim-only "${mixes[@]}" "${views[@]}" --val val --epochs "$EPOCHS" --model-config width=96 --model-config embedding=160 \
     --model-config kinematics=true --seed 1 --encoded inputs --threads 1 --out model.ckpt
 step "the rest of the benchmark's runs"

@@ -1,4 +1,4 @@
-"""Divide a YCB folder into training objects and, every fifth object, test objects.
+"""Divide a YCB folder of either layout into training objects and, every fifth object, test objects.
 
 Objects are divided in the order of their keys, so that the same folder always gives the same two parts.
 """
@@ -7,18 +7,26 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import is_inside, read_regular, whole_file
+from datagen.workers.objects.ycb import INDEXES, MANISKILL_INDEXES
 from datagen.workers.source_statement import STATEMENT
 
 Part = Literal["train", "test"]
 EVERY = 5
-INDEX = "objects.json"
 _MOST_BYTES = 16 * 2**20
 _FIX = "Correct it or fetch the index again"
+
+
+@dataclass(frozen=True)
+class _Object:
+    key: str
+    entry: Any  # in the index
+    files: list[str]  # relative to the folder
 
 
 def split_objects(source: Path, out: Path) -> dict[Part, int]:
@@ -28,30 +36,33 @@ def split_objects(source: Path, out: Path) -> dict[Part, int]:
     an OUT that holds other objects.
     """
     source, out = source.resolve(), out.resolve()
-    objects = sorted(_read(source), key=lambda entry: entry["key"])
-    kept = [entry for i, entry in enumerate(objects) if i % EVERY != EVERY - 1]
+    index = next((source / name for name in INDEXES if (source / name).is_file()), source / INDEXES[0])
+    objects = sorted(_read(source, index), key=lambda each: each.key)
+    kept = [each for i, each in enumerate(objects) if i % EVERY != EVERY - 1]
     held_out = objects[EVERY - 1 :: EVERY]
-    _write(source, out / "train", kept)
-    _write(source, out / "test", held_out)
+    _write(source, out / "train" / index.name, kept)
+    _write(source, out / "test" / index.name, held_out)
     return {"train": len(kept), "test": len(held_out)}
 
 
-def _read(source: Path) -> list[dict[str, Any]]:
-    """The entries of the index, checked: keys are unique, and files are in the folder."""
-    index = source / INDEX
-    data = read_regular(index, _MOST_BYTES, "Name a folder of YCB objects that has one")
+def _read(source: Path, index: Path) -> list[_Object]:
+    """The objects of the index, checked: keys are unique, and files are in the folder."""
+    data = read_regular(index, _MOST_BYTES, f"Name a folder of YCB objects, with one of {', '.join(INDEXES)}")
     try:
         entries = json.loads(data)
     except (ValueError, RecursionError) as error:
         raise InputError(index, "", f"is not JSON ({error})", _FIX) from None
-    if not isinstance(entries, list) or len(entries) < EVERY:
-        raise InputError(index, "", f"is not a list of {EVERY} objects or more", _FIX)
-    keys: set[str] = set()
+    is_maniskill = index.name in MANISKILL_INDEXES
+    if not isinstance(entries, dict if is_maniskill else list) or len(entries) < EVERY:
+        kind = "an object" if is_maniskill else "a list"
+        raise InputError(index, "", f"is not {kind} of {EVERY} objects or more", _FIX)
+    if is_maniskill:
+        return [_Object(key, entry, _model_files(source, index, key)) for key, entry in entries.items()]
+    found: dict[str, _Object] = {}
     for number, entry in enumerate(entries):
         key, files = (entry.get(name) if isinstance(entry, dict) else None for name in ("key", "files"))
-        if not isinstance(key, str) or key in keys:
+        if not isinstance(key, str) or key in found:
             raise InputError(index, f"[{number}].key", "is not a unique name", _FIX)
-        keys.add(key)
         if not isinstance(files, dict) or not files:
             raise InputError(index, f"[{number}].files", "names no files", _FIX)
         for path in files.values():
@@ -59,20 +70,31 @@ def _read(source: Path) -> list[dict[str, Any]]:
             if not is_known or not is_inside(source, source / path) or not (source / path).is_file():
                 problem = f"{str(path)[:80]!r} is no file inside {source}"
                 raise InputError(index, f"[{number}].files", problem, _FIX)
-    return entries
+        found[key] = _Object(key, entry, list(files.values()))
+    return list(found.values())
 
 
-def _write(source: Path, folder: Path, chosen: list[dict[str, Any]]) -> None:
+def _model_files(source: Path, index: Path, key: str) -> list[str]:
+    """All files of an object in ManiSkill's layout."""
+    home = source / "models" / key
+    if "/" in key or not is_inside(source, home) or not home.is_dir():
+        raise InputError(index, key[:80], f"has no folder in {source / 'models'}", _FIX)
+    inside = [path for path in sorted(home.rglob("*")) if path.is_file() and is_inside(home, path)]
+    return [str(path.relative_to(source)) for path in inside]
+
+
+def _write(source: Path, index: Path, chosen: list[_Object]) -> None:
     """Copy the files, then the index; a folder with another index is left as it is."""
-    index, text = folder / INDEX, json.dumps(chosen, indent=1) + "\n"
+    by_key = {each.key: each.entry for each in chosen}
+    listed = by_key if index.name in MANISKILL_INDEXES else list(by_key.values())
+    folder, text = index.parent, json.dumps(listed, indent=1) + "\n"
     if index.exists():
         if index.read_text() != text:
             raise InputError(index, "", "lists other objects", "Choose another output folder")
         return
-    for entry in chosen:
-        for path in entry["files"].values():
-            (folder / path).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source / path, folder / path)
+    for path in (path for each in chosen for path in each.files):
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source / path, folder / path)
     if (source / STATEMENT).is_file():
         shutil.copyfile(source / STATEMENT, folder / STATEMENT)
     with whole_file(index, alone=True) as file:

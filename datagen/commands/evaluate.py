@@ -54,7 +54,8 @@ def evaluate(
         baselines: Baseline to compare with, or none; repeat for more. [default: all]
         heuristic: Parameters of the analytic baseline, from `datagen calibrate`.
         arrival: Arrival error: normal:M[,YAW], disc:M[,YAW] or nav2. [default: 0 to 25 cm]
-        closed_loop: Scenes of the closed loop, the first whole grids with a good base pose. [default: 0]
+        closed_loop: Scenes of the closed loop, the first whole grids with a good base pose, in unseen houses.
+            [default: no closed loop]
         execute: Execute the plans of the closed loop in disturbed physics, which takes most of the time.
         workers: Processes of the closed loop; 0: this process, for debuggers. [default: cores]
         allow_seen_houses: Report training houses separately instead of failing.
@@ -86,7 +87,10 @@ def evaluate(
 
     file = output_file(out)
     arrivals = [read_arrival(text) for text in arrival or ()]
-    kept = _kept_outcomes(closed_loop, execute, workers, file) if closed_loop else ""
+    loop_options = {"--execute": execute, "--workers": workers is not None, "--houses": given != AS_FOUND}
+    for option in (name for name, is_given in loop_options.items() if is_given and closed_loop is None):
+        raise InputError(option, "", "is for --closed-loop", "Give --closed-loop SCENES, or omit it")
+    kept = "" if closed_loop is None else _kept_outcomes(closed_loop, execute, workers, file)
     checkpoints, run_paths = split_paths([str(path) for path in paths])
     runs = open_evaluated_runs(run_paths)
     models = open_models(checkpoints, runs)
@@ -103,12 +107,13 @@ def evaluate(
     seen = plain.houses.union(*(model.houses for model in models))
     parts = parts_by_houses(columns, seen, candidate_sets_of(runs))
     report = evaluation_report(seconds, methods, runs, parts, fitted_on, plain.left_out, arrivals)
-    if closed_loop:
+    if closed_loop is not None:
         from datagen.evaluation.arrival_outcomes import PLAN, SIM, make_all
         from datagen.evaluation.closed_loop import loop_record, plan_loop
 
         judged = [method.method for method in methods]
-        loop = plan_loop(columns, runs, given, judged, arrivals, closed_loop, SIM if execute else PLAN, kept)
+        mode = SIM if execute else PLAN
+        loop = plan_loop(columns, runs, given, judged, arrivals, closed_loop, mode, kept, seen)
         processes = len(os.sched_getaffinity(0)) if workers is None else workers
         with interruptible() as stopping:
             if not make_all(loop.tasks, processes, stopping, json):

@@ -70,8 +70,11 @@ def plan_loop(
     most_scenes: int,
     mode: str,
     folder: str,
+    seen_houses: frozenset[str] = frozenset(),
 ) -> Loop:
     """The loop over the whole grids of `columns`; without `arrivals`, errors of 0 to 25 cm with a yaw error.
+
+    Scenes in `seen_houses` are left out.
 
     InputError where no scene has a whole grid with a good clear cell.
     """
@@ -80,9 +83,10 @@ def plan_loop(
         fix = "Submit plan or sim with --candidates-per-scene grid"
         raise InputError(place, "candidates", "no scene has a whole grid of one robot", fix)
     good = np.bincount(columns.scene, columns.label & columns.is_clear, columns.n_scenes) > 0
-    kept = np.flatnonzero(columns.is_grid & good)[:most_scenes]
+    is_seen = np.isin(columns.house.astype(str), np.array(sorted(seen_houses), str))
+    kept = np.flatnonzero(columns.is_grid & good & ~is_seen)[:most_scenes]
     if not len(kept):
-        problem = f"none of {int(columns.is_grid.sum())} whole grids has a good clear cell"
+        problem = f"none of {int(columns.is_grid.sum())} whole grids, in unseen houses, has a good clear cell"
         raise InputError(place, "label", problem, "Name a larger run")
     columns_kept = columns.of_scenes(np.isin(np.arange(columns.n_scenes), kept))
     maps = grid_maps(columns_kept)
@@ -111,7 +115,7 @@ def plan_loop(
         )
         for k, (run, scene) in enumerate(origins)
     )
-    without_good = int((columns.is_grid & ~good).sum())
+    without_good = int((columns.is_grid & ~good & ~is_seen).sum())
     return Loop(columns_kept, maps, errors, cells, offsets, tasks, without_good, mode)
 
 

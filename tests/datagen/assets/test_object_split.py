@@ -10,6 +10,7 @@ import pytest
 
 from datagen import cli
 from tests.made_runs import files_of
+from tests.refusals import refused
 
 
 def ycb_folder(folder: Path, *, path: str = "{key}/a.obj", n: int = 10, **more: object) -> Path:
@@ -43,6 +44,33 @@ def test_objects_are_split_by_their_names(tmp_path: Path) -> None:
     # One of its own results, split again into the place where it lies.
     assert cli.run(["assets", "split", str(out / "train"), str(out)]) == 2
     assert files_of(out) == before
+
+
+def fetched(folder: Path, *names: str) -> Path:
+    """A folder as `assets fetch ycb` leaves it."""
+    for name in names:
+        (folder / "models" / name / "textures").mkdir(parents=True)
+        (folder / "models" / name / "textured.obj").write_text(name)
+        (folder / "models" / name / "textures" / "map.png").write_text(name)
+    index = {name: {"density": 1000, "scales": [1.0]} for name in names}
+    (folder / "info_pick_v0.json").write_text(json.dumps(index))
+    return folder
+
+
+def test_a_fetched_folder_is_split_in_its_own_layout(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = [f"{k:03}_thing" for k in range(6)]
+    source, out = fetched(tmp_path / "mani_skill2_ycb", *names), tmp_path / "out"
+    assert cli.run(["assets", "split", str(source), str(out)]) == 0
+    held_out, kept = (json.loads((out / n / "info_pick_v0.json").read_text()) for n in ("test", "train"))
+    assert list(held_out) == ["004_thing"] and sorted(held_out | kept) == names
+    assert held_out["004_thing"] == {"density": 1000, "scales": [1.0]}
+    files = files_of(out)
+    assert files["test/models/004_thing/textures/map.png"] == b"004_thing" and len(files) == 2 * 6 + 2
+    for wrong in ("../secret", "gone"):
+        (source / "info_pick_v0.json").write_text(json.dumps({name: {} for name in [*names, wrong]}))
+        refused(["assets", "split", str(source), str(tmp_path / "other")], capsys, wrong, "has no folder")
 
 
 @pytest.mark.parametrize(

@@ -166,6 +166,9 @@ def test_bad_input_is_refused(
 ) -> None:
     refused(words(grids, tmp_path, workers=999), capfd, "--workers")
     refused(["evaluate", str(grids), "--closed-loop", "1", *QUICK], capfd, "--out: is missing")
+    fitted = ["--fit", str(grids), "--allow-seen-houses", "--baselines", "distance"]
+    loop = ["--closed-loop", "2", "--out", str(tmp_path / "seen.json")]
+    refused(["evaluate", str(grids), *fitted, *loop], capfd, "whole grids, in unseen houses, has")
     near, config = str(tmp_path / "near"), str(grids.parent / "grid.toml")
     drawn = ["--candidates", "in-range", "--candidates-per-scene", "7", "--n", "14", "--workers", "0"]
     assert cli.run(["submit", "plan", *drawn, "--out", near, "--config", config]) == 0

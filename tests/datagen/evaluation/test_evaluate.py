@@ -217,6 +217,10 @@ def test_bad_input_is_refused_in_one_line(
         ([file, run, "--out", "page.html"], ["--out", "not a .json file"]),
         ([file, run, "--out", str(tmp_path / "no" / "page.json")], ["--out", "folder does not exist"]),
         ([file, run, "--arrival", "ring:1"], ["--arrival: ring:1"]),
+        ([file, run, "--execute"], ["--execute: is for --closed-loop"]),
+        ([file, run, "--workers", "2"], ["--workers: is for --closed-loop"]),
+        ([file, run, "--houses", "builtin"], ["--houses: is for --closed-loop"]),
+        ([file, run, "--closed-loop", "0", "--out", "a.json"], ["--closed-loop: 0: is not from 1"]),
     ]
     for words, expected in cases:
         more = [] if "--baselines" in words else ["--baselines", "none"]
