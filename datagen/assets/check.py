@@ -14,6 +14,7 @@ from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import Mesh
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.houses import HOUSE_SOURCES, open_houses
+from datagen.workers.houses.ai2thor import root_of
 from datagen.workers.houses.procthor import house_documents
 from datagen.workers.objects import OBJECT_SOURCES, ObjectModel, ObjectSource, open_objects
 from datagen.workers.rendering import Camera
@@ -70,7 +71,7 @@ def _kind_of(folder: Path) -> str:
         return "habitat"
     if any(house_documents(folder)):
         return "procthor"
-    return "ai2thor" if (folder / "configs" / "scenes").is_dir() else "folder"
+    return "ai2thor" if root_of(folder) is not None else "folder"
 
 
 _SIDE_PX, _SHARPNESS, _TEXT_PX, _COLUMNS = 180, 2, 46, 7

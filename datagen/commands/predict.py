@@ -126,7 +126,7 @@ class PredictOptions:
         base_height: Height of the arm's mount above the floor (m).
         reach: Reach of the arm from its mount (m).
         demo: Predict on the frame that ships with the package; writes demo.png and demo.html.
-        export: With --demo, new folder for a copy of that frame.
+        export: New folder for the frame of --demo or --bag; of --bag also where no target is given yet.
         frame: Frame as a folder, .npz, .ply or .pcd; several with poses are fused.
         bag: Recording of ROS 2 in place of frames: .mcap, .db3 or a folder of rosbag2, with tf.
         at: Seconds from the start of the recording to its frame; several frames are fused.
@@ -187,9 +187,10 @@ class PredictOptions:
         if self.demo and not (self.frame is self.click is self.box is self.bag is None):
             fix = "Omit --demo to predict on a frame of your own"
             raise InputError("--demo", "", "has a frame and a click of its own", fix)
-        if self.export is not None and (not self.demo or Path(self.export).exists()):
-            problem = "exists already" if self.demo else "is given without --demo"
-            raise InputError("--export", str(self.export), problem, "Name a new folder, with --demo")
+        has_frame = self.demo or self.bag is not None
+        if self.export is not None and (not has_frame or Path(self.export).exists()):
+            problem = "exists already" if has_frame else "is given without --demo or --bag"
+            raise InputError("--export", str(self.export), problem, "Name a new folder, with one of them")
         if self.bag is not None and self.frame is not None:
             raise InputError("--bag", "", "is given with --frame", "Give one of them")
         if self.bag is None and (self.at or self.topic):
@@ -278,6 +279,7 @@ def predict(given: PredictOptions) -> Prediction:
     pictures = [each.picture for each in (*maps, *keep_out)]
     _refuse_outputs(out, html, goal, [*named, given.bag, *given.map, *given.keep_out, *pictures, copied])
     if given.bag is not None:
+        from datagen.train.prediction.frames import write_place
         from datagen.train.prediction.recordings import read_recording
 
         recorded = read_recording(Path(given.bag), given.at, given.topic)
@@ -286,6 +288,8 @@ def predict(given: PredictOptions) -> Prediction:
             fix = "Record with localisation, which sends the transform from map to odom, or omit the map"
             raise InputError("--map" if given.map else "--keep-out", "", problem, fix)
         named = recorded.frames
+        if copied is not None:
+            write_place(recorded.frames[0], Path(copied))
         maps = maps or tuple(each for each in [recorded.map] if each is not None)
     frames = [
         read_place(each, given.depth_scale) if isinstance(each, (str, Path)) else each
@@ -321,7 +325,7 @@ def predict(given: PredictOptions) -> Prediction:
         from datagen.train.prediction.goals import write_goal
 
         write_goal(goal, answer, *(("map", 0) if recorded is None else (recorded.world, recorded.stamp_ns)))
-    if copied is not None:
+    if copied is not None and recorded is None:
         shutil.copytree(sample_frame(), copied, copy_function=shutil.copyfile)  # writable
     return answer
 

@@ -118,7 +118,11 @@ def _base(robot: Robot) -> Rows:
         ]
     tucked = f"{len(robot.homes_rad)} poses{_origin(keys.arm.tucked)}"
     shapes = f"{parts} convex parts of {len(robot.link_names)} bodies, {pairs} pairs checked"
-    return [*rows, ("tucked", tucked), ("shapes", shapes)]
+    links = (link for cluster in robot.assembly.chain.clusters for link, _ in cluster.values())
+    seen = [link.name for link in links if link.visuals and not link.collisions]
+    named = ", ".join(seen[:4]) + (f" and {len(seen) - 4} more" if len(seen) > 4 else "")
+    only = [("only seen", f"{named}: without <collision>, so of no shape to the planner")] if seen else []
+    return [*rows, ("tucked", tucked), ("shapes", shapes), *only]
 
 
 def _measures(robot: Robot, q: F64) -> Rows:

@@ -136,7 +136,7 @@ def test_it_has_its_own_name_beside_other_models(tmp_path: Path) -> None:
         (["--demo", "--frame", "x"], "has a frame and a click of its own"),
         (["--frame", "x"], "--base-height: is missing"),
         (["--frame", "x", "--base-height", "0.7"], "--reach: is missing"),
-        (["--frame", "x", "--export", "y"], "is given without --demo"),
+        (["--frame", "x", "--export", "y"], "is given without --demo or --bag"),
         (["--demo", "--export", "a.png", "--out", "a.png"], "Give another name"),
         (["--demo", "--out", "none/a.png"], "its folder does not exist"),
     ],

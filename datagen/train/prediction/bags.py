@@ -11,6 +11,7 @@ from typing import Any
 
 import apsw
 from lz4.frame import LZ4FrameDecompressor
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError, storage_mcap
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
@@ -48,6 +49,9 @@ storage_mcap.DECOMPRESSORS.update(
     zstd=lambda data, size: _unpacked(zstd.ZstdDecompressor(), data, size),
     lz4=lambda data, size: _unpacked(LZ4FrameDecompressor(), data, size),
 )
+# Definitions in files are not used, and rosbags refuses a file that has one of another kind than ROS 2.
+_NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
+vars(storage_mcap)["get_msgdef"] = lambda schema: _NO_DEFINITION
 
 
 class Bag:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 from scipy import ndimage
 
 from datagen.schemas.errors import InputError
@@ -270,6 +272,20 @@ def _npz_frame(path: Path, depth_scale: float | None) -> SensorFrame:
     image = RgbdImage(rgb, depth_m, pinhole, marked, step_m=step_m, notes=notes)
     T = None if pose is None else checked_pose(pose.astype(np.float64), str(path))
     return image_frame(image, T, {name: f"{path}: {name}" for name in ("rgb", "depth", "mask")})
+
+
+def write_place(frame: SensorFrame, folder: Path) -> None:
+    """Write an undistorted frame as a new folder that `read_place` reads."""
+    image, T = frame.image, frame.T_world_camera
+    assert image is not None
+    folder.mkdir(parents=True)
+    Image.fromarray(image.rgb).save(folder / "color.png")
+    np.save(folder / "depth.npy", image.depth_m)
+    p, (height, width) = image.pinhole, image.depth_m.shape
+    numbers = {"fx": p.fx_px, "fy": p.fy_px, "cx": p.cx_px, "cy": p.cy_px, "width": width, "height": height}
+    (folder / "intrinsics.json").write_text(json.dumps(numbers))
+    if T is not None:
+        (folder / "pose.json").write_text(json.dumps({"T_world_camera": T.tolist()}))
 
 
 def _size(picture: npt.NDArray[np.generic]) -> str:

@@ -36,6 +36,17 @@ _FIX = "Download the scenes again."
 _PROCTHOR_STAGE = np.array([[0, 0, -1.0, 0], [0, 1.0, 0, 0], [1.0, 0, 0, 0], [0, 0, 0, 1.0]])
 
 
+def root_of(folder: Path) -> Path | None:
+    """The folder of the data set at or below a folder; None where there is none."""
+    below = (
+        folder,
+        folder / "ai2thor",
+        folder / "scene_datasets/ai2thor",
+        folder / "data/scene_datasets/ai2thor",
+    )
+    return next((root for root in below if (root / _SCENES).is_dir()), None)
+
+
 def open_ai2thor(folder: str) -> HabitatHouses:
     """The scenes below a download folder (the one that holds ai2thor-hab, or one above it).
 
@@ -45,8 +56,7 @@ def open_ai2thor(folder: str) -> HabitatHouses:
     """
     base = Path(folder)
     fix = "Name it as ai2thor:DIR, where DIR holds ai2thor-hab/ and ai2thorhab-uncompressed/."
-    roots = [base, base / "ai2thor", base / "scene_datasets/ai2thor", base / "data/scene_datasets/ai2thor"]
-    root = next((r for r in roots if folder and (r / _SCENES).is_dir()), None)
+    root = root_of(base) if folder else None
     if root is None:
         raise InputError(folder or "ai2thor", "", "has no folder ai2thor-hab/configs/scenes", fix)
     top = root / _SCENES

@@ -89,6 +89,8 @@ def read_trees(source: RobotSource) -> tuple[UrdfTree, UrdfTree]:
     source.refuse_unknown("hand.palm", keys.hand.palm or next(iter(hand.links), ""), hand.links)
     for name in keys.arm.ignore:
         source.refuse_unknown("arm.ignore", name, [*tree.links, *hand.links])
+    for name in keys.arm.cuts_m:
+        source.refuse_unknown("arm.cuts_m", name, tree.links)
     bare = [without_shapes(t, [name for name in keys.arm.ignore if name in t.links]) for t in (tree, hand)]
     return bare[0], bare[0] if hand is tree else bare[1]
 
@@ -143,6 +145,9 @@ def assemble(source: RobotSource, reach_m: float | None) -> Assembly:
     bodies = [
         body_of(name, cluster, scale, cuts) for name, cluster in zip(arm.names, arm.clusters, strict=True)
     ]
+    if not any(body.parts_m for body in bodies[int(arm.turns) + 1 :]):
+        fix = "Give them <collision>, to which a <visual> does not count"
+        raise source.wrong("arm", "no link that moves has a shape", fix)
     k = int(arm.turns)
     base = base_of(source, bodies[k], joints, arm.turns)
     if base.deck_m is not None:

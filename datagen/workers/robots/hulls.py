@@ -58,7 +58,8 @@ def shape_parts(shape: Shape, scale: float, cuts_m: tuple[float, ...] = ()) -> P
         hulls = (_solid(shape.size_m),)
     else:
         assert shape.mesh is not None
-        hulls = tuple(hull * shape.scale for hull in mesh_hulls(shape.mesh, cuts_m))
+        cuts = tuple(sorted(height / float(shape.scale[2]) for height in cuts_m))
+        hulls = tuple(hull * shape.scale for hull in mesh_hulls(shape.mesh, cuts))
     T = shape.T_link_shape
     parts = tuple(((hull @ T[:3, :3].T + T[:3, 3]) * scale).astype(np.float32) for hull in hulls)
     if any(map(_is_flat, parts)):
@@ -113,7 +114,8 @@ def _hulls_of(path: Path, cuts_m: tuple[float, ...]) -> tuple[F64, ...]:
     try:
         return tuple(outer_hull(_slab(points, edges, low, high)) for low, high in itertools.pairwise(bounds))
     except (QhullError, ValueError):
-        pass
+        if cuts_m:
+            raise _wrong(path, f"has no body between two of the cuts {cuts_m} of arm.cuts_m") from None
     # A label or a marker: a sheet of no thickness gets one.
     thick = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2] * _SHEET_M
     try:

@@ -71,6 +71,21 @@ def test_a_recording_gives_the_answer_of_its_frame(
     assert cli.run([*from_bag, "--at", "0.5", "--at", "1.5"]) in (0, 1)
 
 
+def test_the_frame_of_a_recording_is_written_to_click_in(
+    made: Path, scene: Seen, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = str(write(tmp_path, [each for each in record(scene) if each.topic != "/map"]))
+    folder, drop = tmp_path / "frame", ("--frame", "--camera-height")
+    line = arguments(made, "--bag", bag, drop=drop)
+    refused([*line, "--export", str(folder)], capsys, "target: is not marked")
+    with Image.open(folder / "color.png") as picture:
+        np.testing.assert_array_equal(np.asarray(picture), scene.frame.rgb)
+    again = arguments(made, *clicked(made), "--frame", str(folder), drop=drop[1:])
+    of_bag, of_folder = (json_of(capsys, each) for each in ([*line, *clicked(made)], again))
+    assert scored(of_folder) == scored(of_bag)
+    refused([*line, "--export", str(folder)], capsys, "exists already")
+
+
 def test_no_goal_is_written_without_a_good_pose(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from PIL import Image
 
 import datagen
@@ -83,6 +85,25 @@ def test_the_world_without_a_map(seen: Seen, tmp_path: Path, dropped: str, world
         datagen.predict(**asked, map=[room])
     with pytest.raises(InputError, match=f"--keep-out: is no map of the frame {world}"):
         datagen.predict(**asked, keep_out=[room])
+
+
+def test_channels_of_other_encodings_are_passed_over(seen: Seen, tmp_path: Path) -> None:
+    path, mixed = write(tmp_path, record(seen)), tmp_path / "mixed.mcap"
+    with path.open("rb") as whole, mixed.open("wb") as file:
+        writer, channels = Writer(file), dict[int, int]()
+        writer.start("ros2")
+        for schema, channel, message in make_reader(whole).iter_messages():
+            assert schema is not None
+            if channel.id not in channels:
+                of = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, of)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        for name, encoding in (("foxglove.Log", "protobuf"), ("foxglove.Pose", "jsonschema")):
+            at = writer.register_channel(f"/{name}", "json", writer.register_schema(name, encoding, b"{}"))
+            writer.add_message(at, START_S * 10**9, b"{}", START_S * 10**9)
+        writer.finish()
+    (plain,), (found,) = read_recording(path).frames, read_recording(mixed).frames
+    np.testing.assert_array_equal(found.points_m, plain.points_m)
 
 
 def png(pixels: np.ndarray, kind: str = "PNG") -> bytes:

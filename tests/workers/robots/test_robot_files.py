@@ -161,6 +161,23 @@ def test_a_mimic_joint_of_the_arm_has_the_range_that_its_driver_gives_it(make: M
     assert (joint.lower, joint.upper) == pytest.approx((-1.3, 1.7))
 
 
+def test_links_with_a_visual_alone_are_named_and_refused_where_no_other_moves(
+    make: Made, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def seen_only(name: str, *links: str) -> str:
+        file = Path(name).with_name("robot.urdf")
+        for link in links:
+            head, start, tail = file.read_text().partition(f'<link name="{link}"><')
+            file.write_text(head + start + tail.replace("collision>", "visual>", 2))
+        return name
+
+    assert cli.run(["robot", seen_only(make(), "mast", "upper")]) == 0
+    assert "mast, upper: without <collision>" in capsys.readouterr().out
+    bare = seen_only(make(folder="b"), "mast", "shoulder", "upper", "lower", "wrist")
+    with pytest.raises(InputError, match=r"robot\.toml: arm: no link that moves has a shape"):
+        open_robot(bare, None, 0.85)
+
+
 HAND = "".join(
     f'<link name="{name}"><collision><geometry>{LINKS[name].partition("@")[0]}</geometry></collision></link>'
     for name in ("palm", "left", "right")
@@ -255,6 +272,7 @@ def test_a_digest_depends_on_content_and_not_on_the_place(make: Made) -> None:
         (('"base"\n', '"base"\ntucked = [[0.0, 0.0]]\n'), ("", ""), "", r"arm\.tucked: has rows of 2"),
         (('"base"\n', '"base"\nignore = ["gone"]\n'), ("", ""), "", r"arm\.ignore: link gone"),
         (("", ""), ("", ""), '[hand]\npalm = "lower"\n', r"link lower: is not below link palm"),
+        (("", ""), ("", ""), "[arm.cuts_m]\nnope = [0.1]\n", r"arm\.cuts_m: link nope is not in the URDF"),
         (('urdf =', 'reach_m = 0.5\nurdf ='), ("", ""), "", r"reach_m: is 0\.5 m, and the URDF's arm has"),
     ],
 )  # fmt: skip
