@@ -50,7 +50,7 @@ from datagen.train.run_parts import JOIN_FIELDS, RunPart, open_parts
 from datagen.train.scene_table import TABLE_FIELDS
 
 # What methods may use and scoring does not read.
-_SHOWN = ("T_world_camera", "intrinsics_px", "image_size_px", "object_name", "candidate_index")
+_SHOWN = ("distance_m", "T_world_camera", "intrinsics_px", "image_size_px", "object_name", "candidate_index")
 _ZSTD_LEVEL = 22  # small rather than fast
 _PACKED = {*SCENE_FIELDS, *SAMPLE_FIELDS, *TABLE_FIELDS, *EXTRA, *FIELDS, *_SHOWN}
 

@@ -49,14 +49,13 @@ def _read(source: Path, index: Path) -> list[_Object]:
     """The objects of the index, checked: keys are unique, and files are in the folder."""
     data = read_regular(index, _MOST_BYTES, f"Name a folder of YCB objects, with one of {', '.join(INDEXES)}")
     try:
-        entries = json.loads(data)
+        entries: Any = json.loads(data)
     except (ValueError, RecursionError) as error:
         raise InputError(index, "", f"is not JSON ({error})", _FIX) from None
-    is_maniskill = index.name in MANISKILL_INDEXES
-    if not isinstance(entries, dict if is_maniskill else list) or len(entries) < EVERY:
-        kind = "an object" if is_maniskill else "a list"
-        raise InputError(index, "", f"is not {kind} of {EVERY} objects or more", _FIX)
-    if is_maniskill:
+    kind = dict if index.name in MANISKILL_INDEXES else list
+    if type(entries) is not kind or len(entries) < EVERY:
+        raise InputError(index, "", f"is not a {kind.__name__} of {EVERY} objects or more", _FIX)
+    if isinstance(entries, dict):
         return [_Object(key, entry, _model_files(source, index, key)) for key, entry in entries.items()]
     found: dict[str, _Object] = {}
     for number, entry in enumerate(entries):

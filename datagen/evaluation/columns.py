@@ -15,7 +15,7 @@ from datagen.train.scorers import Scorer, scored
 from datagen.workers.bases.candidate_sets import in_set
 
 # Further columns of a batch that the evaluation needs.
-EXTRA = ("base_is_clear", "distance_m", "mount_distance_m", "house_id", "place", "scene_index")
+EXTRA = ("base_is_clear", "mount_distance_m", "house_id", "place", "scene_index")
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,6 @@ class Columns:
     label: Bools  # (N,)
     is_clear: Bools  # (N,)
     base_xy_m: F32  # (N, 2), target frame
-    distance_m: F32  # (N,)
     mount_distance_m: F32  # (N,)
     reach_m: F32  # (N,)
     scores: Mapping[str, F64]  # (N,) each
@@ -121,7 +120,7 @@ def _rows(batch: Batch[Array], first_scene: int, first_robot: int) -> dict[str, 
         "is_clear": batch.extra["base_is_clear"].astype(np.bool_),
         "base_xy_m": batch.candidates.base_xy_m,
         "reach_m": batch.robots.arm_reach_m[robot],
-        **{name: batch.extra[name] for name in ("distance_m", "mount_distance_m")},
+        "mount_distance_m": batch.extra["mount_distance_m"],
     }
 
 

@@ -13,6 +13,8 @@ from datagen.workers.robots.links import LinkBody
 from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.urdf import Inertial, Joint, rotation_rpy
 
+_EFFORT = 1e3  # URDF demands one; the agent's drives limit forces
+
 
 def write_urdf(robot: Robot, folder: Path) -> Path:
     """Write `robot.urdf` and one convex STL file a part into a folder, and return the URDF's path.
@@ -66,7 +68,7 @@ def _add_joint(root: ElementTree.Element, joint: Joint) -> None:
     ElementTree.SubElement(element, "child", link=joint.child)
     if joint.kind != "fixed":
         ElementTree.SubElement(element, "axis", xyz=_text(joint.axis))
-        limits = {"lower": joint.lower, "upper": joint.upper, "velocity": joint.speed, "effort": joint.effort}
+        limits = {"lower": joint.lower, "upper": joint.upper, "velocity": joint.speed, "effort": _EFFORT}
         ElementTree.SubElement(element, "limit", {key: repr(float(value)) for key, value in limits.items()})
 
 

@@ -178,7 +178,6 @@ _STORE = re.compile(r"(data(?:-[0-9]+)?\.zarr)/")
 class Cleaned:
     """Counts of removed files."""
 
-    attempts: int = 0
     files: int = 0
     bytes: int = 0
 
@@ -216,7 +215,6 @@ def clean_runs(storage: Storage, seen: Seen = lambda done, of: None, kept_s: flo
         committed = {object_key(commit.attempt) for commit in run.commits()}
         spare = [file for file in objects if file.key not in committed and file.modified_s < before_s]
         _remove(run.storage, spare, cleaned)
-        cleaned.attempts += len(spare)
         seen(number, len(runs))
     for place in ({run.storage.url: run.storage for run in runs} | {storage.url: storage}).values():
         _clean_rest(place, before_s, cleaned)

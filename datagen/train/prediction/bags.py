@@ -51,7 +51,7 @@ storage_mcap.DECOMPRESSORS.update(
 )
 # Definitions in files are not used, and rosbags refuses a file that has one of another kind than ROS 2.
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
-vars(storage_mcap)["get_msgdef"] = lambda schema: _NO_DEFINITION
+storage_mcap.get_msgdef = lambda schema: _NO_DEFINITION
 
 
 class Bag:

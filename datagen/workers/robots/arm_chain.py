@@ -141,7 +141,6 @@ class ArmChain:
                     low,
                     high,
                     1.0,
-                    1e3,
                 )
             )
         for joint in self._joints:

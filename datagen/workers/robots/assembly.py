@@ -159,9 +159,7 @@ def assemble(source: RobotSource, reach_m: float | None) -> Assembly:
         last = bodies[-1]
         bodies[-1] = replace(last, parts_m=(*last.parts_m, tube), drawn_m=(*last.drawn_m, tube))
     no_axis = np.array([0.0, 0.0, 1.0])
-    mount = Joint(
-        "hand_mount", "fixed", arm.names[-1], hand.bodies[0].name, T_palm, no_axis, 0.0, 0.0, 0.0, 0.0
-    )
+    mount = Joint("hand_mount", "fixed", arm.names[-1], hand.bodies[0].name, T_palm, no_axis, 0.0, 0.0, 0.0)
     found = Assembly((*bodies, *hand.bodies), joints, mount, hand, base, arm, scale, np.zeros(3), 0.0)
     return _with_reach(source, found)
 

@@ -69,7 +69,6 @@ class Joint:
     lower: float
     upper: float
     speed: float
-    effort: float
     mimic: tuple[str, float, float] | None = None  # name, multiplier, offset
 
 
@@ -281,7 +280,7 @@ class _Reader:
         if parent is None or child is None:
             raise _wrong(self.path, where, "has no parent or no child")
         axis = np.array([1.0, 0.0, 0.0])
-        lower, upper, speed, effort = -math.inf, math.inf, math.inf, math.inf
+        lower, upper, speed = -math.inf, math.inf, math.inf
         if kind in _MOVING:
             axis = self.numbers(element.find("axis"), "xyz", 3, where, "1 0 0")
             if np.linalg.norm(axis) < 1e-6:
@@ -289,10 +288,7 @@ class _Reader:
             axis = axis / np.linalg.norm(axis)
             limit = element.find("limit")
             if limit is not None:
-                speed, effort = (
-                    float(self.numbers(limit, key, 1, where, "0", math.inf)[0])
-                    for key in ("velocity", "effort")
-                )
+                speed = float(self.numbers(limit, "velocity", 1, where, "0", math.inf)[0])
                 most = MOST if kind == "prismatic" else math.inf  # turns are cut to two each way
                 if kind != "continuous":
                     lower, upper = (
@@ -307,7 +303,7 @@ class _Reader:
             found = (mimic.get("joint", ""), ratio, offset)
         return Joint(
             name, kind, parent.get("link", ""), child.get("link", ""), self.origin(element, where),
-            axis, lower, upper, speed, effort, found,
+            axis, lower, upper, speed, found,
         )  # fmt: skip
 
 

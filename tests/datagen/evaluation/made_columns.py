@@ -31,7 +31,6 @@ def make_columns(
         label=label,
         is_clear=is_clear,
         base_xy_m=base_xy_m,
-        distance_m=(mount_m * 0.9).astype(np.float32),
         mount_distance_m=mount_m,
         reach_m=reach_m,
         scores=dict(scores) if scores is not None else {"random": rng.random(n)},
