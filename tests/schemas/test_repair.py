@@ -156,7 +156,7 @@ def test_garbage_is_removed_and_all_else_keeps_its_bytes(place: str, tmp_path: P
     run, garbage = littered(tmp_path / "run" if place == "disk" else f"{bucket}/run")
     before = without(run.storage, garbage)
     cleaned = clean_runs(run.storage, kept_s=-HOUR_S)
-    assert (cleaned.files, cleaned.attempts) == (len(garbage), 2) and cleaned.bytes > 0
+    assert cleaned.files == len(garbage) and cleaned.bytes > 0
     assert tree(run.storage) == before and not (tmp_path / "run" / "data-2.zarr").exists()
     assert len(run.ledger.attempts()) == 5  # all are kept
     assert clean_runs(run.storage, kept_s=-HOUR_S).files == 0 and found(run.storage.url) == []
