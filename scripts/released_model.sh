@@ -15,7 +15,7 @@ MIX=${MIX:-40000}    # of that arm at places of all kinds
 HARD=${HARD:-40000}  # of that arm in scenes of which four in five are decisive
 EACH=${EACH:-8000}   # of each other arm there
 VAL=${VAL:-3000}
-EPOCHS=${EPOCHS:-10}
+EPOCHS=${EPOCHS:-12}
 OTHERS="fetch xarm7 tiago-pro ur5 stretch3"
 
 need_assets_and_programs
