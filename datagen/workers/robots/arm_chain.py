@@ -10,7 +10,7 @@ from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import translation
 from datagen.workers.robots.hand import Hand
-from datagen.workers.robots.links import cluster_of, scaled_pose
+from datagen.workers.robots.links import cluster_of, refuse_followers, scaled_pose
 from datagen.workers.robots.reach import Chain, largest_reach_m
 from datagen.workers.robots.robot_file import RobotSource
 from datagen.workers.robots.urdf import FIX, Joint, Link, UrdfTree, rpy_rotation
@@ -33,8 +33,9 @@ class ArmChain:
         keys = source.keys
         self.tree, self.keys, self.turns = tree, keys, keys.base.presents == "turns"
         chain = tree.chain(keys.arm.base, keys.arm.tip)
-        for name in (*keys.arm.held, *(name for group in keys.arm.coupled for name in group)):
+        for name in (name for group in keys.arm.coupled for name in group):
             tree.joint(name)
+        refuse_followers(source, tree, "arm.held", keys.arm.held)
         self._joints = [j for j in chain if j.kind != "fixed" and tree.driver(j)[0].name not in keys.arm.held]
         if not self._joints:
             raise source.wrong(

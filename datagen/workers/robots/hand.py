@@ -12,7 +12,7 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.kinematics.tree import KinematicTree
 from datagen.workers.robots.gripper import Gripper
 from datagen.workers.robots.hand_measures import Fingers, HandMeasures
-from datagen.workers.robots.links import Cluster, LinkBody, body_of, cluster_of
+from datagen.workers.robots.links import Cluster, LinkBody, body_of, cluster_of, refuse_followers
 from datagen.workers.robots.robot_file import RobotSource
 from datagen.workers.robots.urdf import Joint, UrdfTree
 
@@ -78,8 +78,8 @@ def hand_of(source: RobotSource, tree: UrdfTree, palm: str) -> Hand:
 def _moving(source: RobotSource, tree: UrdfTree, palm: str) -> list[Joint]:
     """The joints that open the hand, each after the one that carries it."""
     keys, found, waiting = source.keys.hand, list[Joint](), [palm]
-    for name in (*keys.fingers, *keys.range):
-        tree.joint(name)
+    refuse_followers(source, tree, "hand.fingers", keys.fingers)
+    refuse_followers(source, tree, "hand.range", keys.range)
     while waiting:
         for joint in tree.children(waiting.pop(0)):
             waiting.append(joint.child)

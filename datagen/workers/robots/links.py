@@ -11,6 +11,7 @@ from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.kinematics.tree import joint_motion
 from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.hulls import shape_parts
+from datagen.workers.robots.robot_file import RobotSource
 from datagen.workers.robots.urdf import Inertial, Joint, Link, Shape, UrdfTree, scaled_inertial
 
 
@@ -86,6 +87,13 @@ def body_of(
         visuals = []
     drawn = () if visuals else tuple(parts)
     return LinkBody(name, inertial, tuple(parts), tuple(visuals), scale, drawn)
+
+
+def refuse_followers(source: RobotSource, tree: UrdfTree, field: str, names: Iterable[str]) -> None:
+    """Raise InputError for a joint that is missing, or that mimics another, which decides."""
+    for name in names:
+        if (driver := tree.driver(tree.joint(name))[0].name) != name:
+            raise source.wrong(field, f"joint {name} mimics {driver}", f"Name {driver}")
 
 
 def without_shapes(tree: UrdfTree, names: Iterable[str]) -> UrdfTree:

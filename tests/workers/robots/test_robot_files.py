@@ -272,6 +272,8 @@ def test_a_digest_depends_on_content_and_not_on_the_place(make: Made) -> None:
         (('"base"\n', '"base"\ntucked = [[0.0, 0.0]]\n'), ("", ""), "", r"arm\.tucked: has rows of 2"),
         (('"base"\n', '"base"\nignore = ["gone"]\n'), ("", ""), "", r"arm\.ignore: link gone"),
         (("", ""), ("", ""), '[hand]\npalm = "lower"\n', r"link lower: is not below link palm"),
+        (("", ""), ("", ""), "[hand.range]\nfollow = [0.0, 0.1]\n", r"hand\.range: joint follow mimics open"),
+        (("", ""), ("", ""), "[arm.held]\nfollow = 0.1\n", r"arm\.held: joint follow mimics open. Name open"),
         (("", ""), ("", ""), "[arm.cuts_m]\nnope = [0.1]\n", r"arm\.cuts_m: link nope is not in the URDF"),
         (('urdf =', 'reach_m = 0.5\nurdf ='), ("", ""), "", r"reach_m: is 0\.5 m, and the URDF's arm has"),
     ],
