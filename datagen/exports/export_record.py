@@ -72,7 +72,10 @@ def is_intact(storage: Storage, file: FileEntry) -> bool:
 
 def read_export(storage: Storage) -> ExportRecord | None:
     """The record of the export in a folder; None where it has none. InputError where it is damaged."""
-    return read_record(storage, EXPORT, ExportRecord)
+    try:
+        return read_record(storage, EXPORT, ExportRecord)
+    except InputError as error:
+        raise InputError(error.place, error.field, error.problem, _AGAIN) from None
 
 
 def check_export(storage: Storage, record: ExportRecord) -> Iterator[tuple[str, str]]:

@@ -112,6 +112,8 @@ def test_verify_says_whether_an_export_is_still_its_run(
     assert "export.json: the run has changed since" in capsys.readouterr().out
     shutil.move(copied, tmp_path / "elsewhere")
     refused(["verify", str(out)], capsys, "export.json", "no such folder")
+    (out / "export.json").write_bytes(b"torn")
+    refused(["verify", str(out)], capsys, "export.json", "Export again into a new --out")
 
 
 def _verified(out: Path, capsys: pytest.CaptureFixture[str]) -> str:
