@@ -76,9 +76,10 @@ def serve(given: ServeOptions) -> None:
     if not 1 <= given.port <= 65535:
         raise InputError("--port", str(given.port), "is not between 1 and 65535", "Choose another")
     app = app_of(given)
-    config = uvicorn.Config(app, log_level="warning", limit_concurrency=64)
     with Progress() as shown, _listening(given.host, given.port) as bound:
         shown.phase(f"listening on http://{given.host}:{given.port}, described at /docs")
+        # Not before: it takes over the process's logging.
+        config = uvicorn.Config(app, log_level="warning", limit_concurrency=64)
         uvicorn.Server(config).run([bound])
 
 
