@@ -16,4 +16,4 @@ def test_drivers_make_way_for_each_other() -> None:
     with memory_folder() as folder:
         told = drive_in_pairs(folder, shards=80, seconds=0.1, workers=2)
     assert told["drivers that won shards"] == 2
-    assert told["attempts wasted"] < 40  # each of the first windows, and at their meetings: not every shard
+    assert told["attempts wasted"] < 60  # each of the first windows, and at their meetings: not every shard
