@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import is_inside, read_regular, whole_file
-from datagen.workers.objects.ycb import INDEXES, MANISKILL_INDEXES
+from datagen.workers.objects import MANISKILL_INDEXES, YCB_INDEXES
 from datagen.workers.source_statement import STATEMENT
 
 Part = Literal["train", "test"]
@@ -36,7 +36,9 @@ def split_objects(source: Path, out: Path) -> dict[Part, int]:
     an OUT that holds other objects.
     """
     source, out = source.resolve(), out.resolve()
-    index = next((source / name for name in INDEXES if (source / name).is_file()), source / INDEXES[0])
+    index = next(
+        (source / name for name in YCB_INDEXES if (source / name).is_file()), source / YCB_INDEXES[0]
+    )
     objects = sorted(_read(source, index), key=lambda each: each.key)
     kept = [each for i, each in enumerate(objects) if i % EVERY != EVERY - 1]
     held_out = objects[EVERY - 1 :: EVERY]
@@ -47,7 +49,9 @@ def split_objects(source: Path, out: Path) -> dict[Part, int]:
 
 def _read(source: Path, index: Path) -> list[_Object]:
     """The objects of the index, checked: keys are unique, and files are in the folder."""
-    data = read_regular(index, _MOST_BYTES, f"Name a folder of YCB objects, with one of {', '.join(INDEXES)}")
+    data = read_regular(
+        index, _MOST_BYTES, f"Name a folder of YCB objects, with one of {', '.join(YCB_INDEXES)}"
+    )
     try:
         entries: Any = json.loads(data)
     except (ValueError, RecursionError) as error:

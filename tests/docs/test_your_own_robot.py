@@ -58,9 +58,9 @@ def test_the_steps_work_as_written(
     # A file that moved is named; another one is refused.
     Path("elsewhere").mkdir()
     moved = Path("ur10.toml").rename("elsewhere/ur10.toml")
-    assert cli.run(["resume", "runs/ur10", "--n", "45", "--workers", "0"]) == 2
+    assert cli.run(["resume", "runs/ur10", "--n", "75", "--workers", "0"]) == 2
     assert "ur10.toml" in capsys.readouterr().err
-    assert cli.run(["resume", "runs/ur10", "--n", "45", "--workers", "0", "--robot", str(moved)]) == 0
+    assert cli.run(["resume", "runs/ur10", "--n", "75", "--workers", "0", "--robot", str(moved)]) == 0
     moved.write_text(moved.read_text() + 'name = "other"\n')
-    assert cli.run(["resume", "runs/ur10", "--n", "60", "--workers", "0", "--robot", str(moved)]) == 2
+    assert cli.run(["resume", "runs/ur10", "--n", "90", "--workers", "0", "--robot", str(moved)]) == 2
     assert "but the run was made with ur10" in capsys.readouterr().err.replace("\n", " ")

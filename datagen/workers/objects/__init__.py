@@ -14,6 +14,9 @@ OBJECT_SOURCES: dict[str, str] = {
     "folder": "datagen.workers.objects.folder:open_folder",
     "ycb": "datagen.workers.objects.ycb:open_ycb",
 }
+# Indexes of a folder of YCB objects: ours, and ManiSkill's.
+MANISKILL_INDEXES = ("info_pick_v0.json", "info_raw.json")
+YCB_INDEXES = ("objects.json", *MANISKILL_INDEXES)
 
 
 def open_objects(ref: str) -> ObjectSource:

@@ -20,13 +20,14 @@ from datagen.schemas.identity import digest_of
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.content_cache import CacheFolder
 from datagen.workers.extras import versions_of
+from datagen.workers.objects import YCB_INDEXES
 from datagen.workers.objects.decomposition import LATE
 from datagen.workers.objects.model import LoadedOnce, ObjectModel, ObjectSource
 from datagen.workers.objects.object_files import TABLE, ObjectFiles, find_objects
 from datagen.workers.objects.object_reading import GIVEN, Given, read_object
 from datagen.workers.objects.scan import CACHE, model_of, restored_scan, stored_scan
 from datagen.workers.objects.surfaces import SUFFIXES
-from datagen.workers.objects.ycb import INDEXES, YcbObjects
+from datagen.workers.objects.ycb import YcbObjects
 from datagen.workers.source_statement import read_statement
 
 # Part of every digest: raise it when the same files are read differently.
@@ -119,7 +120,7 @@ def open_folder(folder: str) -> ObjectSource:
     if not folder:
         raise InputError("folder", "", "has no folder", "Write `folder:DIR`")
     path = Path(folder).expanduser()
-    return YcbObjects(path) if any((path / name).is_file() for name in INDEXES) else FolderObjects(path)
+    return YcbObjects(path) if any((path / name).is_file() for name in YCB_INDEXES) else FolderObjects(path)
 
 
 def _read_table(path: Path, names: set[str]) -> dict[str, Given]:

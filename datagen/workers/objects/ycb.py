@@ -19,6 +19,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
 from datagen.schemas.safe_files import is_inside, read_regular
 from datagen.workers.json_document import parse_json
+from datagen.workers.objects import MANISKILL_INDEXES, YCB_INDEXES
 from datagen.workers.objects.model import LoadedOnce, ObjectModel
 from datagen.workers.objects.obj_file import read_obj_header
 from datagen.workers.objects.scan import (
@@ -88,8 +89,6 @@ def open_ycb(folder: str) -> YcbObjects:
 
 MAX_INDEX_BYTES = 16 * 2**20
 MAX_OBJECTS = 10_000
-MANISKILL_INDEXES = ("info_pick_v0.json", "info_raw.json")
-INDEXES = ("objects.json", *MANISKILL_INDEXES)
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]{0,99}$")]
 _Mass = Annotated[float, Field(gt=0, le=50, allow_inf_nan=False)]
@@ -143,7 +142,7 @@ def read_layout(folder: Path) -> tuple[Path, list[Entry]]:
         index = folder / name
         if index.is_file():
             return index, _maniskill(folder, index)
-    wanted = ", ".join(INDEXES)
+    wanted = ", ".join(YCB_INDEXES)
     raise InputError(
         folder,
         "",
