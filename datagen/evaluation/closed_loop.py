@@ -70,7 +70,7 @@ def plan_loop(
     most_scenes: int,
     mode: str,
     folder: str,
-    seen_houses: frozenset[str] = frozenset(),
+    seen_houses: frozenset[str],
 ) -> Loop:
     """The loop over the whole grids of `columns`; without `arrivals`, errors of 0 to 25 cm with a yaw error.
 

@@ -24,6 +24,7 @@ OPTIONS: list[tuple[str, list[str]]] = [
     ("--workers 5000", ["--workers", "5000", "4096"]),
     ("--workers two", ["--workers", "two"]),
     ("--workers 0.5", ["--workers", "0.5"]),
+    ("--workers 0 --address auto", ["--workers: 0: is given with --address auto"]),
     ("--seed 1.5", ["--seed", "1.5"]),
     ("--seed -1", ["seed", "-1", "0"]),
     ("--seed 9223372036854775808", ["seed", "9223372036854775808"]),

@@ -6,7 +6,7 @@ import os
 import re
 import signal
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +78,13 @@ def play(
     summary = drive(range(shards), make_task, executor, recorder, policy, heard, stop)
     assert list(notes.iterdir()) == []  # neither notes nor stacks are left behind
     return Played(summary, recorder, folder)
+
+
+def test_a_job_takes_no_more_slots_of_a_cluster_than_it_was_given(ray: Any) -> None:
+    free = RayExecutor(perform, replace(SETTINGS, address="auto", workers=None), ray).slots
+    assert free > 1
+    assert RayExecutor(perform, replace(SETTINGS, address="auto", workers=1), ray).slots == 1
+    assert RayExecutor(perform, replace(SETTINGS, address="auto", workers=free + 9), ray).slots == free
 
 
 @dataclass(frozen=True)

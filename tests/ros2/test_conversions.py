@@ -94,6 +94,14 @@ def middle(mask: np.ndarray) -> tuple[int, int]:
     return int(u[k]), int(v[k])
 
 
+def test_depth_of_another_frame_than_colour_is_refused() -> None:
+    seen = draw_seen(0)
+    color, depth, info, T, _ = messages(seen, get_typestore(Stores.ROS2_HUMBLE))
+    depth.header.frame_id = "camera_depth_optical_frame"
+    with pytest.raises(ValueError, match="not aligned to colour: their frames are camera_depth"):
+        conversions.request_body(color, depth, info, T)
+
+
 @pytest.mark.parametrize(
     ("name", "encoding", "colour", "pad"), [("humble", "16UC1", "rgb8", 0), ("jazzy", "32FC1", "bgra8", 5)]
 )

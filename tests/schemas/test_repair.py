@@ -195,8 +195,10 @@ def test_nothing_is_removed_while_a_job_may_be_alive(
     (tmp_path / "jobs/20200101T000000-00000000.json").write_bytes(b"damaged")
     if is_alive:
         for change in (clean_runs, repair_runs):
-            with pytest.raises(InputError, match="is running"):
+            with pytest.raises(InputError, match="is running") as refused:
                 change(run.storage)
+            # Of a machine that is gone nobody can ask.
+            assert (f"remove jobs/{record.id}.json" in str(refused.value)) == (host == "elsewhere")
         assert files_of(tmp_path).items() >= before.items()
         jobs.put_state(JobState(id=record.id, updated=utc_now(), phase="ended", end="complete"))
     assert clean_runs(run.storage, kept_s=-60).files == len(garbage)

@@ -49,6 +49,21 @@ def test_rotating_the_candidates_alone_changes_logits(model: Model):
     assert float(change.abs().amax()) > 1e-3
 
 
+@torch.no_grad()
+def test_training_alone_leaves_out_tokens_and_hand_poses():
+    model, tables = small_model("shared", dropout=0.0, hand_poses=24), drawn_tables(3)
+    scores: dict[bool, list[Tensor]] = {False: [], True: []}
+    for is_training in scores:
+        model.train(is_training)
+        for seed in (1, 2, 1):
+            torch.manual_seed(seed)
+            scores[is_training].append(model.score(*tables))
+    model.eval()
+    (one, other, again), (first, second, repeated) = scores[False], scores[True]
+    assert torch.equal(one, other) and torch.equal(one, again)
+    assert torch.equal(first, repeated) and float((first - second).abs().amax()) > 1e-3
+
+
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(0, 5), max_size=60), st.integers(1, 12))
 def test_tiles_hold_every_candidate_once_with_its_robot(rows: list[int], size: int):

@@ -178,6 +178,17 @@ def test_links_with_a_visual_alone_are_named_and_refused_where_no_other_moves(
         open_robot(bare, None, 0.85)
 
 
+@needs_robots
+def test_an_arm_is_checked_against_its_deck() -> None:
+    robot = open_robot("ur5", None, 0.4)
+    names = [robot.link_names[a] + " " + robot.link_names[b] for a, b in robot.self_pairs]
+    assert "base_link forearm_link" in names  # touches in half of all poses
+    # From a pose of the forearm level over the deck the elbow is lowered until it stands in it.
+    q = np.array([0.0, -0.3, 0.0, 0.0, 0.0, 0.0])
+    lowered = [bool(robot.collides_itself(q + [0.0, angle, 0.0, 0.0, 0.0, 0.0])) for angle in (0.0, 0.6)]
+    assert lowered == [False, True]
+
+
 HAND = "".join(
     f'<link name="{name}"><collision><geometry>{LINKS[name].partition("@")[0]}</geometry></collision></link>'
     for name in ("palm", "left", "right")
