@@ -110,7 +110,6 @@ def answerer(given: ServeOptions) -> Callable[..., dict[str, Any]]:
     """A function that answers requests, in one process."""
     from datagen.train.prediction import load_scorer, read_map
     from datagen.train.prediction.service import answer_of
-    from datagen.train.program_scorer import ProgramScorer
 
     scorer, own_maps = load_scorer(given.checkpoint), [read_map(each) for each in given.map]
     names = "robot", "base_height", "reach", "footprint"
@@ -119,9 +118,7 @@ def answerer(given: ServeOptions) -> Callable[..., dict[str, Any]]:
     fixed |= {"keep_out": [read_map(each) for each in given.keep_out]}
 
     def ask(frames: list[SensorFrame], options: dict[str, Any]) -> Prediction:
-        candidates, maps = options.pop("candidates"), [*options.pop("map"), *own_maps]
-        if isinstance(scorer, ProgramScorer):
-            scorer.only_clear = not candidates  # other scores are not shown
+        maps = [*options.pop("map"), *own_maps]
         return predict(scorer, frame=frames, map=maps, **fixed, **options)
 
     return partial(answer_of, ask)

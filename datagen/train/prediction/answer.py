@@ -21,6 +21,7 @@ from datagen.train.prediction.base_cells import (
     RobotSize,
     headings,
     seen_share,
+    within_reach,
 )
 from datagen.train.prediction.frames import SensorFrame
 from datagen.train.prediction.fusing import SeenPoints
@@ -126,10 +127,8 @@ class Prediction:
 
         Within reach: from the arm's mount to the target's centre. Where it is high, parking decides little.
         """
-        rise_m = self.target.center_m[2] - self.robot.base_height_m
         rows = self.rows("clear")
-        far_m = np.hypot(np.linalg.norm(self.cells.offset_m[rows], axis=1), rise_m)
-        near = rows[far_m <= self.robot.arm_reach_m]
+        near = rows[within_reach(self.cells.offset_m[rows], self.target.center_m[2], self.robot)]
         return float((self.score[near] >= _LIKELY).mean()) if len(near) else None
 
     @cached_property
@@ -147,6 +146,11 @@ class Prediction:
         """Share of the frames' pixels without depth; None for clouds without pictures."""
         shares = [(f.image.depth_m == 0).mean() for f in self.frames if f.image is not None]
         return float(np.mean(shares)) if shares else None
+
+    @property
+    def expected(self) -> F64 | None:
+        """Success (N,) expected with the arrival error; None without one, and where no pose is best."""
+        return None if self.arrival is None else self.choice.chance
 
     @property
     def level(self) -> Literal["good", "doubtful", "none"]:
@@ -174,7 +178,7 @@ class Prediction:
 
     def doubts_about(self, row: int) -> tuple[tuple[str, str], ...]:
         """Codes and texts of what speaks against one base pose; how far it may be missed only of the best."""
-        score, expected = self.score[row], self.choice.expected
+        score, expected = self.score[row], self.expected
         miss_m = self.choice.miss_m if row == self.best else None
         is_unseen = self.cells.state[row] == STATES.index(UNSEEN)
         is_tight = expected is None and miss_m is not None and miss_m < _LEAST_MISS_M

@@ -68,6 +68,12 @@ def headings(offset_m: F32, robot: RobotSize) -> F64:
     return (yaw_rad + robot.yaw_rad + np.pi) % (2 * np.pi) - np.pi if robot.yaw_rad else yaw_rad
 
 
+def within_reach(offset_m: F32, height_m: float, robot: RobotSize) -> Bools:
+    """Mask (N,) of bases at offsets (N, 2) from the target whose arm reaches to its centre at `height_m`."""
+    far_m = np.hypot(np.linalg.norm(offset_m, axis=1), height_m - robot.base_height_m)
+    return far_m <= robot.arm_reach_m
+
+
 def observe_cells(
     seen: SeenPoints,
     center_m: F64,
@@ -195,14 +201,18 @@ class Choice:
 
     best: int | None
     nominal: int | None  # the row with the best score
-    expected: F64 | None  # (N,) success expected with the arrival error; None without one
+    chance: F64 | None  # (N,) success expected where the robot stops; None where none is best
     miss_m: float | None  # distance by which the robot may miss the best while scores stay good
     can_stand: Bools  # (N,) whether a pose may be chosen
     ranked: I64  # (K,) rows of those with a good score, best first
 
 
 def choose(
-    score: F64, cells: BaseCells, allowed: Sequence[str], threshold: float, arrival: Arrival | None
+    score: F64,
+    cells: BaseCells,
+    allowed: Sequence[str],
+    threshold: float,
+    arrival: Arrival | None,
 ) -> Choice:
     """The best of the cells in an `allowed` state; with an arrival error by the mean score on arrival.
 
@@ -219,9 +229,9 @@ def choose(
     side = round(float(np.sqrt(len(score))))
     step_m = float(np.ptp(cells.offset_m[:, 0]) / (side - 1))
     value = stands(score, can_stand).reshape(side, side)
-    expected = None if arrival is None else expected_success(value, step_m, arrival).ravel()
+    chance = score if arrival is None else expected_success(value, step_m, arrival).ravel()
     good = rows[~(score[rows] < threshold)]
-    ranked = good[np.argsort(-(score if expected is None else expected)[good], kind="stable")]
-    best = nominal if expected is None else int(rows[np.argmax(expected[rows])])
+    ranked = good[np.argsort(-chance[good], kind="stable")]
+    best = int(ranked[0])
     miss_m = None if np.isnan(threshold) else tolerance_m(value, step_m, divmod(best, side), threshold)
-    return Choice(best, nominal, expected, miss_m, can_stand, ranked)
+    return Choice(best, nominal, chance, miss_m, can_stand, ranked)

@@ -13,7 +13,7 @@ import numpy as np
 from datagen.released import RELEASED, released_program
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import CandidateParams
-from datagen.train.arrivals import Arrival
+from datagen.train.arrivals import Arrival, normal_arrival
 from datagen.train.headings import refuse_other_heading, trained_side_deg
 from datagen.train.inputs import F64, Array, Batch, CandidateInputs, Clouds, RobotInputs
 from datagen.train.prediction.answer import CROP, Prediction
@@ -25,6 +25,7 @@ from datagen.train.prediction.base_cells import (
     RobotSize,
     choose,
     observe_cells,
+    within_reach,
 )
 from datagen.train.prediction.clicks import Box, box_mask, click_mask
 from datagen.train.prediction.frames import SensorFrame, image_frame
@@ -40,6 +41,10 @@ if TYPE_CHECKING:
     from datagen.train.training.checkpoints import CheckpointHead
 
 _SLACK_M = 0.01  # how far a robot's sizes may be beyond those of the training data
+# Base poses along each side of the grid: 0.05 m apart, as maps' cells are. A coarser grid has none in narrow
+# gaps between furniture.
+_SIDE = 41
+_STOPS_M = 0.02  # from its goal, even a robot that arrives well
 
 
 def load_scorer(checkpoint: str | Path | None = None) -> ModelScorer | ProgramScorer:
@@ -63,13 +68,13 @@ def load_scorer(checkpoint: str | Path | None = None) -> ModelScorer | ProgramSc
         2
     """
     if checkpoint is None or checkpoint == RELEASED:
-        return ProgramScorer(released_program(), "the released model, ")
+        return ProgramScorer(released_program(), "the released model, ", only_clear=True)
     # Imported here: the released model needs no torch.
     from datagen.train.training.checkpoints import load_model
 
     model, head = load_model(str(checkpoint))
     name, side_deg = f"{head.model} ({head.stage})", trained_side_deg(head)
-    return ModelScorer(model, name, robots=trained_robots(head), side_deg=side_deg)
+    return ModelScorer(model, name, only_clear=True, robots=trained_robots(head), side_deg=side_deg)
 
 
 def trained_robots(head: CheckpointHead) -> dict[str, tuple[float, float]]:
@@ -97,19 +102,21 @@ def predict(
     allow_unseen: bool = False,
     arrival: Arrival | None = None,
     known: KnownFloor | None = None,
-    grid: int = 25,
+    grid: int = _SIDE,
     seed: int = 0,
 ) -> Prediction:
     """Score a square grid of base poses around the target that the frames show.
 
-    Several frames need a pose each. `camera_height_m` is that of the camera that took the frame; with
-    `gravity` (3,), in its frame, or the floor in sight it gives the pose of a frame that has none.
-    The target is given by masks, by one click or a box in the first frame, or by a cloud's own marks;
-    `target_center_m` (3,), world, replaces the estimated centre. With an `arrival` error the best is the cell
-    with the highest expected success. A map of the floor that is `known` is in the frame of the poses of the
-    frames. InputError where arguments are missing or invalid.
+    A model's score is 0 where the base cannot stand and where the arm does not reach. Several frames need a
+    pose each. `camera_height_m` is that of the camera that took the frame; with `gravity` (3,), in its frame,
+    or the floor in sight it gives the pose of a frame that has none. The target is given by masks, by one
+    click or a box in the first frame, or by a cloud's own marks; `target_center_m` (3,), world, replaces the
+    estimated centre. With an `arrival` error the best is the cell with the highest expected success; without
+    one a model's best is that of a robot that stops well, so that of equal scores the one with room is taken.
+    A map of the floor that is `known` is in the frame of the poses of the frames. InputError where arguments
+    are missing or invalid.
     """
-    if isinstance(scorer, (ModelScorer, ProgramScorer)):
+    if is_model := isinstance(scorer, (ModelScorer, ProgramScorer)):
         side_deg = 0.0 - math.degrees(robot.yaw_rad)
         refuse_other_heading("datagen predict", "--robot", side_deg, scorer.name, scorer.side_deg)
     if known is not None and any(frame.T_world_camera is None for frame in frames):
@@ -134,7 +141,8 @@ def predict(
     cells = observe_cells(seen, centre, robot, params, yaw_rad, known)
     score = scored(scorer, _batch(cloud, target, robot, cells))
     allowed = (CLEAR, UNSEEN) if allow_unseen else (CLEAR,)
-    choice = choose(score, cells, allowed, scorer.threshold, arrival)
+    stops = normal_arrival(_STOPS_M) if arrival is None and is_model else arrival
+    choice = choose(score, cells, allowed, scorer.threshold, stops)
     read = (note for frame in frames if frame.image is not None for note in frame.image.notes)
     notes = (*read, *_notes(grounds, filled, cloud))
     sizes = (("untrained_size", note) for note in robot_notes(scorer, robot))
@@ -235,7 +243,7 @@ def _locate(seen: SeenPoints) -> TargetBox:
 
 def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, cells: BaseCells) -> Batch[Array]:
     """The base poses as input of a scorer; `base_is_clear` is false where it cannot stand or get to."""
-    n = len(cells.offset_m)
+    n, near = len(cells.offset_m), within_reach(cells.offset_m, target.center_m[2], robot)
 
     def one(value: float) -> Array:
         return np.array([value], np.float32)
@@ -261,7 +269,7 @@ def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, cells: BaseCells) 
         ),
         np.zeros(n, np.int64),
         np.zeros((n, 16), np.uint8),
-        {"base_is_clear": np.isin(cells.state, (STATES.index(CLEAR), STATES.index(UNSEEN)))},
+        {"base_is_clear": np.isin(cells.state, (STATES.index(CLEAR), STATES.index(UNSEEN))) & near},
     )
 
 

@@ -139,7 +139,6 @@ def make_app(workers: WorkerProcesses, model: str, token: str | None) -> FastAPI
             "arrival": arrival,
             "allow_unseen": allow_unseen,
             "camera_height": camera_height,
-            "candidates": candidates,
         }
         at, sides = (None if text is None else [*map(int, text.split(","))] for text in (click, box))
         frames = [Sent(bytes(data), at, sides), *sessions.get(session or "", ())][:MOST_FRAMES]

@@ -121,17 +121,16 @@ def test_a_map_decides_what_is_free(table: SensorFrame, scorer: ModelScorer) -> 
 
 def test_a_way_over_known_floor_must_lead_there(table: SensorFrame, scorer: ModelScorer) -> None:
     free = of(scorer, table, mapped(FREE, table))
-    assert free.best is not None
-    goal, camera = free.base_xy_m[free.best], free.grounds[0].T_world_camera[:2, 3]
+    clear, camera = free.rows("clear"), free.grounds[0].T_world_camera[:2, 3]
+    far = clear[np.linalg.norm(free.base_xy_m[clear] - camera, axis=1) > 1.05]
     walled = mapped(FREE, table)
     x, y = np.moveaxis(np.stack(np.meshgrid(*[np.arange(240)] * 2)) * 0.05 + 0.025, 0, 0)
     xy = np.stack([x, y], axis=-1) + walled.origin[:2]
     away = xy - camera
     ring = (np.linalg.norm(away, axis=-1) > 0.6) & (np.linalg.norm(away, axis=-1) < 0.75)
-    assert np.linalg.norm(goal - camera) > 0.8
     cells = np.where(ring, np.int8(OCCUPIED), walled.cells)
     closed = of(scorer, table, replace(walled, cells=cells))
-    assert closed.cells.state[free.best] == STATES.index("unreachable")
+    assert len(far) and (closed.cells.state[far] == STATES.index("unreachable")).all()
 
 
 def test_no_base_stands_where_it_shall_keep_out(table: SensorFrame, scorer: ModelScorer) -> None:

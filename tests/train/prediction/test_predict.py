@@ -9,21 +9,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
 
 import datagen
 from datagen import released
 from datagen.schemas.specification import CandidateParams
+from datagen.train.arrivals import normal_arrival
 from datagen.train.baselines.rules import Analytic
 from datagen.train.inputs import Array, Batch
 from datagen.train.prediction import RobotSize, predict
 from datagen.train.prediction.answer import Prediction
-from datagen.train.prediction.base_cells import STATES
+from datagen.train.prediction.base_cells import STATES, BaseCells, choose
 from datagen.train.prediction.frames import SensorFrame
 from datagen.train.prediction.ground import level_pose
+from datagen.train.prediction.occupancy import KnownFloor
 from datagen.train.scorers import ModelScorer, Scorer
+from datagen.workers.bases.candidates import grid_offsets
 from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import look_at, yaw_pose
+from datagen.workers.occupancy_map import FREE, OCCUPIED, OccupancyMap
 from tests.train.prediction.checkpoints import write_untrained
 from tests.train.prediction.seen_scenes import MODEL, Seen, draw_seen, sensor_frame, write_frame
 
@@ -206,13 +213,67 @@ def test_the_best_is_clear_and_its_poses_agree(seen: Seen, scorer: ModelScorer) 
     answer = of(scorer, sensor_frame(seen))
     assert answer.best is not None
     clear = answer.rows("clear")
-    assert answer.best == clear[0] and answer.score[answer.best] == answer.score[clear].max()
+    chance = answer.choice.chance
+    assert chance is not None and answer.best in clear and chance[answer.best] == chance[clear].max()
     T = answer.T_world_base(answer.best)
     np.testing.assert_allclose(T[:3, 3], [*answer.base_xy_m[answer.best], ROBOT.base_height_m], atol=1e-6)
     towards = answer.center_m[:2] - T[:2, 3]
     np.testing.assert_allclose(T[:2, 0], towards / np.linalg.norm(towards), atol=1e-5)
     back = answer.grounds[0].T_world_camera @ answer.T_camera_base(answer.best)
     np.testing.assert_allclose(back, T, atol=1e-9)
+
+
+@given(st.integers(9, 41), st.data())
+def test_of_about_equal_scores_the_pose_with_room_is_taken(side: int, data: st.DataObject) -> None:
+    """A lone pose with the highest score loses to the middle of a patch that is nearly as good."""
+    offsets = grid_offsets(CandidateParams(grid_cells=side)).astype(np.float32)
+    x, y = (data.draw(st.integers(0, side - 3)) for _ in range(2))
+    patch = np.zeros((side, side), np.bool_)
+    patch[y : y + 3, x : x + 3] = True
+    rows = np.flatnonzero(~ndimage.binary_dilation(patch, np.ones((3, 3))).ravel())
+    lone = int(data.draw(st.sampled_from(rows.tolist())))
+    stands = patch.ravel() | (np.arange(side**2) == lone)
+    state = np.where(stands, STATES.index("clear"), STATES.index("blocked"))
+    score = np.where(np.arange(side**2) == lone, 0.93, np.where(stands, 0.92, 0.0))
+    cells = BaseCells(offsets, state, np.zeros(side**2, np.int64))
+    best = choose(score, cells, ("clear",), 0.5, normal_arrival(0.02)).best
+    assert best == (y + 1) * side + x + 1
+    assert choose(score, cells, ("clear",), 0.5, None).best == lone
+
+
+class Flat:
+    name, threshold = "flat", 0.5
+
+    def score(self, batch: Batch[Array]) -> F64:
+        return np.ones(len(batch))
+
+
+@given(st.floats(0, 1), st.sampled_from([0, 1]))
+@settings(max_examples=15)
+def test_a_gap_with_a_hand_of_room_has_a_pose_of_the_grid(seen: Seen, shift: float, axis: int) -> None:
+    """Between two walls that leave the base 6 cm, wherever they are."""
+    frame, camera = sensor_frame(seen), seen.camera.T_world_camera[:2, 3]
+    cells = np.full((600, 600), FREE, np.int8)  # 12 m around the camera
+    across = (np.arange(600) + 0.5) * 0.02 - 6.0
+    half_m, side_m = ROBOT.outline.radius_m + 0.03, 0.1 * shift
+    cells[abs(across - side_m) >= half_m] = OCCUPIED  # rows go along y: the gap leads along x
+    cells = cells if axis else np.ascontiguousarray(cells.T)
+    known = KnownFloor((OccupancyMap("gap", cells, 0.02, (camera[0] - 6, camera[1] - 6, 0.0)),))
+    target = np.append(camera + [[0.0, 0.7], [0.7, 0.0]][axis], 0.8)
+    points = frame.points_m[:1]  # nothing else is in the way
+    alone = replace(frame, points_m=np.repeat(points, 50, axis=0), rgb=np.zeros((50, 3), np.uint8))
+    alone = replace(alone, on_target=np.ones(50, np.bool_), image=None)
+    answer = predict(Flat(), [alone], ROBOT, known=known, target_center_m=target)
+    assert len(answer.rows("clear"))
+
+
+def test_scores_are_of_poses_where_the_base_can_stand_and_the_arm_reaches() -> None:
+    frame = released.sample_frame()
+    answer = datagen.predict(frame=[frame], map=[frame / released.MAP], base_height=0.7, reach=0.6)
+    far_m = np.hypot(np.linalg.norm(answer.cells.offset_m, axis=1), answer.center_m[2] - 0.7)
+    can = (far_m <= 0.6) & np.isin(answer.cells.state, [STATES.index(name) for name in ("clear", "unseen")])
+    assert can.any() and (answer.score[can] > 0).all() and (answer.score[~can] == 0).all()
+    assert len(answer.score) == 41**2
 
 
 def test_unseen_base_poses_are_chosen_only_with_allow_unseen(seen: Seen, scorer: ModelScorer) -> None:
@@ -225,7 +286,9 @@ def test_unseen_base_poses_are_chosen_only_with_allow_unseen(seen: Seen, scorer:
     strict, lax = of(scorer, frame), of(scorer, frame, allow_unseen=True)
     assert strict.best is None and strict.level == "none"
     assert strict.reasons[0] == "no clear base pose was observed around the target"
-    assert lax.best is not None and lax.best == strict.rows("unseen")[0]
+    assert lax.best is not None and lax.best in strict.rows("unseen")
+    unseen, chance = strict.rows("unseen"), lax.choice.chance
+    assert chance is not None and chance[lax.best] == chance[unseen].max()
     assert lax.level == "doubtful" and any("not visible" in reason for reason in lax.reasons)
 
 
