@@ -59,7 +59,6 @@ class BaseCells:
 
     offset_m: F32  # (N, 2), from the target's centre, world axes
     state: I64  # (N,), index into STATES
-    way: I64  # (N,), index into WAYS: how the base gets there from the camera
 
 
 def headings(offset_m: F32, robot: RobotSize) -> F64:
@@ -116,7 +115,7 @@ def observe_cells(
     state[(share >= SEEN_SHARE) & (way == WAYS.index("seen"))] = STATES.index(CLEAR)
     state[way == WAYS.index("none")] = STATES.index(UNREACHABLE)
     state[blocked] = STATES.index(BLOCKED)
-    return BaseCells(offsets.astype(np.float32), state, way)
+    return BaseCells(offsets.astype(np.float32), state)
 
 
 def seen_share(cloud_m: F32, radius_m: float) -> float:
