@@ -317,7 +317,6 @@ def _refuse_no_scene(world: World, houses: str) -> None:
 
 
 def _candidate_fields(options: SubmitOptions) -> dict[str, Any]:
-    """Fields of --candidates and --candidates-per-scene, by dotted name."""
     kind, number = options.candidates, _per_scene(options.candidates_per_scene)
     if kind == "grid":
         if number not in (None, "grid"):

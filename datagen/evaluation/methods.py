@@ -89,7 +89,6 @@ class EvaluatedMethod:
 
     @property
     def method(self) -> Method:
-        """The method for the metrics."""
         is_probability = isinstance(self.scorer, (ModelScorer, ProgramScorer, Scalars)) or (
             isinstance(self.scorer, ScoreFile) and self.scorer.gives_probabilities
         )

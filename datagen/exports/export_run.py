@@ -58,7 +58,6 @@ class Made:
     files: Sequence[ExportedFile]
 
     def sums(self, *counts: str) -> list[int]:
-        """Sums of counts over all files."""
         return [sum(file.counts.get(name, 0) for file in self.files) for name in counts]
 
 
@@ -133,7 +132,6 @@ class ExportSource:
 
 
 def _cut(place: ShardPlace, low: int, high: int) -> ShardPlace:
-    """A shard's wanted scenes `low` to `high`."""
     each, rows = place.full_samples // place.full_scenes, place.rows
     samples = min(high * each, rows.samples) - low * each
     return replace(place, rows=Rows(rows.first + low, high - low, samples))

@@ -130,7 +130,6 @@ def _body(
 
 
 def _splits(table: str, files: Sequence[ExportedFile]) -> list[tuple[str, list[ExportedFile]]]:
-    """Splits of a table that have rows, with their files."""
     found = {s: [f for f in files if f.path.startswith(f"{table}/{s}-")] for s in _SPLITS.values()}
     return [(split, mine) for split, mine in found.items() if mine]
 

@@ -82,7 +82,6 @@ class JobOptions:
             refuse_unusable(self.address)
 
     def display(self) -> Progress:
-        """The display of progress on standard error."""
         return Progress(self.json, console=Console(file=io.StringIO()) if self.quiet else None)
 
 
@@ -153,11 +152,9 @@ class Job:
         return result
 
     def missing(self) -> list[ShardRanges]:
-        """The shards of each run that are to be made."""
         return [job_run.run.missing() for job_run in self.runs]
 
     def record(self, missing: Sequence[ShardRanges]) -> JobRecorder:
-        """Publish the job's record."""
         command, shards = ("datagen", *self.command), sum(map(len, missing))
         return JobRecorder(Jobs(self.storage), command, self.options.address, shards)
 

@@ -308,7 +308,6 @@ class Run:
 
     @property
     def command_for_missing(self) -> str:
-        """The command that makes the shards that are missing."""
         more = " --quarantined" if self.quarantined() else ""
         return f"datagen resume {self.storage.url}{more}"
 

@@ -163,7 +163,6 @@ class SharedModel(Model):
 
     @property
     def logit_layer(self) -> nn.Module:
-        """The last layer of the head."""
         return list(self.head.modules())[-1]
 
     def forward(

@@ -47,7 +47,6 @@ class RobotSize:
 
     @property
     def outline(self) -> Footprint:
-        """Outline of the base."""
         if self.footprint is not None:
             return self.footprint
         return Footprint(float(CandidateParams(scaled_base=True).radius_of_base_m(self.arm_reach_m)))

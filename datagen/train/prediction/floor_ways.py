@@ -124,7 +124,6 @@ def _crowded(points_m: F32, low: F64, size: tuple[int, int]) -> Bools:
 
 
 def _distance_m(obstacle: Bools) -> F64:
-    """Distance of each cell to the nearest obstacle."""
     if not obstacle.any():
         return np.full(obstacle.shape, np.inf)
     return np.asarray(ndimage.distance_transform_edt(~obstacle, sampling=CELL_M), np.float64)

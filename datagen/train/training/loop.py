@@ -183,7 +183,6 @@ def _end_epoch(training: Training, clock: _Clock) -> dict[str, Any]:
 
 
 def _refuse(quantity: str, at: Position, batch: Batch[Array], bad: Tensor) -> NoReturn:
-    """Raise InputError that names the samples."""
     ids = [bytes(i).hex() for i in batch.sample_id[bad.cpu().numpy()]]
     named = ", ".join(ids[:_IDS_NAMED]) + (", ..." if len(ids) > _IDS_NAMED else "")
     raise InputError(

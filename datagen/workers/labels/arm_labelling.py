@@ -95,7 +95,6 @@ class ArmInScene:
         return yaw_pose(x, y, self.robot.base_height_m, yaw_rad)
 
     def path_generator(self, index: int, spec: Specification) -> np.random.Generator:
-        """The generator of plans from candidate `index`, in this draw."""
         other = (self.draw,) if self.draw else ()
         return generator(spec.seed, Stream.PATH, self.scene.index, self.scene.retry, index, *other)
 

@@ -233,7 +233,6 @@ def check_settled(
 
 
 def _lowest_m(model: ObjectModel, T_world_object: F64) -> float:
-    """Height of the object's lowest point, world."""
     z = T_world_object[2, :3]
     return float(min((part @ z).min() for part in model.convex_parts_m) + T_world_object[2, 3])
 
