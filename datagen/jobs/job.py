@@ -85,12 +85,6 @@ class JobOptions:
         return Progress(self.json, console=Console(file=io.StringIO()) if self.quiet else None)
 
 
-def refuse_odd_n(n: int) -> None:
-    """Raise InputError for a number of labels out of range."""
-    if not 1 <= n <= 10**12:
-        raise InputError("--n", str(n), "is not between 1 and 10^12", "Give the number of labels wanted")
-
-
 @dataclass(frozen=True, eq=False)
 class JobRun:
     """One run of a job, and its sources."""
