@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -16,7 +17,6 @@ from datagen.exports import FORMATS
 from datagen.exports.export_record import (
     ExportedFile,
     ExportRecord,
-    address_from,
     is_intact,
     read_export,
     refuse_other_export,
@@ -175,7 +175,7 @@ def export_run(
     wanted = ExportRecord(
         format=to,
         version=__version__,
-        run=address_from(run, storage),
+        run=os.path.relpath(run.folder, storage.folder) if run.folder and storage.folder else run.url,
         run_sha256=run_digest(source.runs),
         spec_hashes=tuple(each.manifest.spec_hash for each in source.runs),
         scenes=(source.first, source.past),
