@@ -138,7 +138,7 @@ def _outcome(
 ) -> tuple[str, PlanReport | None]:
     """The outcome, including the stages before planning that cost nothing."""
     robot = prepared.robot
-    if prepared.grasps_free == 0:
+    if prepared.around.grasps_free == 0:
         return "no_grasp", None
     shoulder_m = T_world_base[:3, :3] @ robot.shoulder_m + T_world_base[:3, 3]
     if np.linalg.norm(prepared.around.arrays.T_world_tcp[:, :, 3] - shoulder_m, axis=1).min() > robot.reach_m:

@@ -93,12 +93,12 @@ def checks() -> Iterator[Check]:
         yield Check(f"extra {name}", partial(_extra, name), how_to_get(name), "ok")
     if not EXTRAS["labels"].missing():
         fix = "Install the libraries named above, or use the engine that works: settle.engine in --config"
-        yield Check("labels", partial(_probe, LABELS.format(source="heuristic")), fix, "fail")
+        yield Check("labels", partial(probe, LABELS.format(source="heuristic")), fix, "fail")
     if find_spec("ray"):
-        yield Check("ray", partial(_probe, RAY), f"{_AGAIN} ray; or use --workers 0.")
+        yield Check("ray", partial(probe, RAY), f"{_AGAIN} ray; or use --workers 0.")
     if not EXTRAS["sim"].missing():
         fix = f"See the libraries above, or: {_AGAIN} numba coal mani-skill sapien"
-        yield Check("sim labels", partial(_probe, LABELS.format(source="sim")), fix)
+        yield Check("sim labels", partial(probe, LABELS.format(source="sim")), fix)
 
 
 def found(check: Check) -> Finding:
@@ -175,13 +175,6 @@ def _extra(name: str) -> str:
     return EXTRAS[name].gives
 
 
-def _probe(code: str) -> str:
-    answer = probe(code)
-    if not answer.succeeded:
-        raise Problem(answer.text)
-    return answer.text
-
-
 def as_table(findings: list[Finding]) -> Table:
     """A table with one row per finding; the fix is below it."""
     table = Table(box=None, pad_edge=False, show_header=False)
@@ -237,24 +230,19 @@ print("ray " + ray.__version__)
 _DEADLINE_S = 600.0
 
 
-@dataclass(frozen=True)
-class Probe:
-    """The result of a probe: its last line of output, or why there is none."""
-
-    succeeded: bool
-    text: str
-
-
-def probe(code: str, timeout_s: float = _DEADLINE_S) -> Probe:
-    """Run Python code in a new interpreter."""
+def probe(code: str, timeout_s: float = _DEADLINE_S) -> str:
+    """Run Python code in a new interpreter; return its last line of output. Problem says why it failed."""
     command = [sys.executable, "-W", "ignore", "-c", code]
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, errors="replace", timeout=timeout_s, check=False
         )
     except subprocess.TimeoutExpired:
-        return Probe(False, f"no result within {timeout_s:.0f} s")
+        raise Problem(f"no result within {timeout_s:.0f} s") from None
     if done.returncode < 0:
-        return Probe(False, f"crashed with {signal.Signals(-done.returncode).name}")
+        raise Problem(f"crashed with {signal.Signals(-done.returncode).name}")
     said = (done.stderr if done.returncode else done.stdout).strip().splitlines()
-    return Probe(done.returncode == 0, said[-1][:200] if said else f"exit code {done.returncode}")
+    text = said[-1][:200] if said else f"exit code {done.returncode}"
+    if done.returncode:
+        raise Problem(text)
+    return text

@@ -214,6 +214,11 @@ def give_up(
     assert run.quarantine(record)
 
 
+def attempts_of(run: Run) -> set[str]:
+    """The attempts of a run's ledger."""
+    return {file.key.split("/")[1].split(".")[0] for file in run.storage.list("ledger")}
+
+
 def files_of(folder: Path, *below: str) -> dict[str, bytes]:
     """Every file of a folder, or of some of the folders in it, by relative path."""
     roots = [folder / name for name in below] or [folder]

@@ -183,7 +183,6 @@ class JobRecorder:
         self._put(phase="sealing", in_flight=0)
 
     def end(self, end: JobEnd, code: int, cause: str, summary: JobSummary | None = None) -> None:
-        """Publish how the job ended."""
         counts: dict[str, float] = {}
         if summary is not None:
             counts |= _counts(summary.totals)

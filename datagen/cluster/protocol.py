@@ -191,11 +191,6 @@ class JobSummary:
     def remaining(self) -> int:
         return self.totals.shards - self.totals.finished
 
-    @property
-    def exit_code(self) -> int:
-        """Exit status of the command line."""
-        return EXIT_CODES.get(self.end, 0)
-
     def plus(self, later: JobSummary) -> JobSummary:
         """The sum of both, for one job over several runs, with the worse end and its first cause."""
         worst = max(self, later, key=lambda summary: get_args(End).index(summary.end))

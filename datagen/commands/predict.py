@@ -84,27 +84,18 @@ def _demo_page() -> Path | None:
     return DEMO_PAGE if find_spec("plotly") else None
 
 
-def _pixel(kind: Any, tokens: Sequence[Token]) -> tuple[int, int]:
-    text = tokens[0].value
-    parts = text.split(",")
-    if len(parts) != 2 or not all(re.fullmatch(r"\s*[0-9]{1,6}\s*", part, re.ASCII) for part in parts):
-        raise InputError("--click", text[:40], "is not a pixel", "Give column and row as u,v: 320,240")
-    return int(parts[0]), int(parts[1])
+def _pixels(option: str, count: int, problem: str, fix: str) -> Parameter:
+    def read(kind: Any, tokens: Sequence[Token]) -> tuple[int, ...]:
+        parts = (text := tokens[0].value).split(",")
+        if len(parts) != count or not all(re.fullmatch(r"\s*[0-9]{1,6}\s*", p, re.ASCII) for p in parts):
+            raise InputError(option, text[:40], problem, fix)
+        return tuple(map(int, parts))
+
+    return Parameter(converter=read, n_tokens=1, metavar="STR")
 
 
-def _box(kind: Any, tokens: Sequence[Token]) -> tuple[int, int, int, int]:
-    text = tokens[0].value
-    found = re.fullmatch(r"\s*,\s*".join([r"\s*([0-9]{1,6})"] * 4) + r"\s*", text, re.ASCII)
-    if found is None:
-        raise InputError(
-            "--box", text[:40], "is no box", "Give LEFT,TOP,RIGHT,BOTTOM in pixels: 280,200,360,300"
-        )
-    left, top, right, bottom = map(int, found.groups())
-    return left, top, right, bottom
-
-
-def _text(kind: Any, tokens: Sequence[Token]) -> str:
-    return tokens[0].value
+_CLICK = _pixels("--click", 2, "is not a pixel", "Give column and row as u,v: 320,240")
+_BOX = _pixels("--box", 4, "is no box", "Give LEFT,TOP,RIGHT,BOTTOM in pixels: 280,200,360,300")
 
 
 def _numbers(kind: Any, tokens: Sequence[Token]) -> list[float]:
@@ -161,17 +152,17 @@ class PredictOptions:
     bag: File | None = None
     at: Annotated[Sequence[float], _UNSET] = ()
     topic: Annotated[Sequence[str], _UNSET] = ()
-    click: Annotated[tuple[int, int] | None, Parameter(converter=_pixel, n_tokens=1, metavar="STR")] = None
-    box: Annotated[tuple[int, int, int, int] | None, Parameter(converter=_box, n_tokens=1, metavar="STR")] = (
-        None
-    )
+    click: Annotated[tuple[int, int] | None, _CLICK] = None
+    box: Annotated[tuple[int, int, int, int] | None, _BOX] = None
     camera_height: float | None = None
     gravity: Annotated[
         Sequence[float] | None,
         Parameter(converter=_numbers, n_tokens=1, metavar="STR", allow_leading_hyphen=True),
     ] = None
     robot_camera_height: float | None = None
-    footprint: Annotated[Outline | None, Parameter(converter=_text, n_tokens=1, metavar="STR")] = None
+    footprint: Annotated[
+        Outline | None, Parameter(converter=lambda kind, tokens: tokens[0].value, n_tokens=1, metavar="STR")
+    ] = None
     depth_scale: float | None = None
     allow_unseen: bool = False
     map: Annotated[Maps, _UNSET] = ()

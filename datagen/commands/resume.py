@@ -20,12 +20,12 @@ from datagen.console.command_lines import (
 from datagen.console.options import LABELLED, RUN, Sources, Whole, option
 from datagen.console.printing import counted
 from datagen.jobs.detach import detach_job
-from datagen.jobs.job import Job, JobOptions, JobRun, refuse_odd_n
+from datagen.jobs.job import Job, JobOptions, JobRun
 from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.start_job import open_job_run, with_absolute_paths, words_to_resume
 from datagen.schemas.errors import InputError
 from datagen.schemas.quarantine import lift_quarantine
-from datagen.schemas.run import Run, open_runs
+from datagen.schemas.run import Run, open_runs, refuse_odd_n
 from datagen.schemas.storage import open_storage
 
 

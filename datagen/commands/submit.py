@@ -29,7 +29,7 @@ from datagen.console.command_lines import (
 from datagen.console.options import LABELLED, ROBOT, RUNNING, Whole, option
 from datagen.display.progress import Progress
 from datagen.jobs.detach import detach_job
-from datagen.jobs.job import Job, JobOptions, JobRun, refuse_odd_n
+from datagen.jobs.job import Job, JobOptions, JobRun
 from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.start_job import (
     refuse_unusable_engines,
@@ -38,7 +38,7 @@ from datagen.jobs.start_job import (
 )
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import MERGED, refuse_other
-from datagen.schemas.run import Run
+from datagen.schemas.run import Run, refuse_odd_n
 from datagen.schemas.run_records import Manifest, StageClock
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import open_storage
@@ -317,7 +317,6 @@ def _refuse_no_scene(world: World, houses: str) -> None:
 
 
 def _candidate_fields(options: SubmitOptions) -> dict[str, Any]:
-    """Fields of --candidates and --candidates-per-scene, by dotted name."""
     kind, number = options.candidates, _per_scene(options.candidates_per_scene)
     if kind == "grid":
         if number not in (None, "grid"):

@@ -114,7 +114,6 @@ class _Found:
         self.kept: list[Finding] = []
 
     def take(self, findings: Iterable[Finding]) -> None:
-        """Count the findings and keep the first."""
         for finding in findings:
             self.counts[finding.kind] += 1
             if len(self.kept) < _KEPT:

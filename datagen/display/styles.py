@@ -15,39 +15,38 @@ Marker = str | tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Style:
-    """Style of one item of a figure: colour, matplotlib marker, words, edge colour and group."""
+    """Style of one item of a figure: colour, matplotlib marker, words and edge colour."""
 
     colour: str
     marker: Marker
     words: str
     edge: str = "#000000"
-    group: str = ""
 
 
 _GOOD, _BAD = "#1764c0", "#f08c00"
-_BASE, _ARM, _PATH, _PHYSICS = "base", "hand and arm", "path", "execution"
 
 
-def _outcome(group: str, colour: str, marker: str, words: str) -> Style:
-    return Style(colour, marker, words, colour, group)
+def _outcome(colour: str, marker: str, words: str) -> Style:
+    return Style(colour, marker, words, colour)
 
 
+# Outcomes of one stage have one marker.
 OUTCOME_STYLES: dict[str, Style] = {
-    "success": _outcome("success", _GOOD, "o", "the arm lifts the target and holds it"),
-    "base_collision": _outcome(_BASE, "#6b6b6b", "s", "the robot's base collides"),
-    "out_of_reach": _outcome(_BASE, "#c2c2c2", "s", "the arm is too short"),
-    "no_grasp": _outcome(_ARM, "#9fdc8a", "^", "the hand collides in every grasp"),
-    "no_ik": _outcome(_ARM, "#2f9e44", "^", "no joint angles reach a grasp"),
-    "arm_collision": _outcome(_ARM, "#0b4d1f", "^", "the arm collides at every grasp"),
-    "no_start": _outcome(_PATH, "#ffdf3d", "D", "every tucked start pose collides"),
-    "no_path": _outcome(_PATH, "#f79a0c", "D", "no free path to the pregrasp"),
-    "no_approach": _outcome(_PATH, "#b5610a", "D", "no straight path to the grasp"),
-    "no_lift": _outcome(_PATH, "#5b3206", "D", "no straight path up"),
-    "not_reached": _outcome(_PHYSICS, "#ffadc2", "X", "the arm did not arrive"),
-    "missed": _outcome(_PHYSICS, "#f2509f", "X", "closed on nothing"),
-    "slipped": _outcome(_PHYSICS, "#dd1f1a", "X", "held, but not lifted with the hand"),
-    "dropped": _outcome(_PHYSICS, "#8f0d4c", "X", "lifted, then lost"),
-    "unstable": _outcome(_PHYSICS, "#8046d6", "X", "the physics diverged"),
+    "success": _outcome(_GOOD, "o", "the arm lifts the target and holds it"),
+    "base_collision": _outcome("#6b6b6b", "s", "the robot's base collides"),
+    "out_of_reach": _outcome("#c2c2c2", "s", "the arm is too short"),
+    "no_grasp": _outcome("#9fdc8a", "^", "the hand collides in every grasp"),
+    "no_ik": _outcome("#2f9e44", "^", "no joint angles reach a grasp"),
+    "arm_collision": _outcome("#0b4d1f", "^", "the arm collides at every grasp"),
+    "no_start": _outcome("#ffdf3d", "D", "every tucked start pose collides"),
+    "no_path": _outcome("#f79a0c", "D", "no free path to the pregrasp"),
+    "no_approach": _outcome("#b5610a", "D", "no straight path to the grasp"),
+    "no_lift": _outcome("#5b3206", "D", "no straight path up"),
+    "not_reached": _outcome("#ffadc2", "X", "the arm did not arrive"),
+    "missed": _outcome("#f2509f", "X", "closed on nothing"),
+    "slipped": _outcome("#dd1f1a", "X", "held, but not lifted with the hand"),
+    "dropped": _outcome("#8f0d4c", "X", "lifted, then lost"),
+    "unstable": _outcome("#8046d6", "X", "the physics diverged"),
 }
 
 LABEL_STYLES = {1: Style(_GOOD, "o", "good", _GOOD), 0: Style(_BAD, "v", "bad", _BAD)}

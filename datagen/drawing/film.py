@@ -14,6 +14,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 from scipy.ndimage import binary_erosion
 
 from datagen.display.styles import PHASE_COLOURS, TARGET
+from datagen.drawing.floor_plan import height_m
 from datagen.drawing.posed_robot import RobotBodies
 from datagen.workers.geometry.mesh import F64, Mesh, concatenate
 from datagen.workers.geometry.transforms import inverse, look_at
@@ -256,7 +257,7 @@ def _best_view(
     All points (N, 3) lie in the image, and the camera `distance_m` from their centre. A group counts with its
     weight times the share of it that other bodies leave visible, mean over the stages.
     """
-    walls = [body for body in house.bodies if _is_wall(body)]
+    walls = [body for body in house.bodies if body.kind == "wall" and height_m(body) > _WALL_M]
     open_house, middle_m = _rays_without(house, walls), (points_m.min(0) + points_m.max(0)) / 2
     found: list[tuple[float, int, View]] = []
     for elevation in np.radians(_ELEVATIONS_DEG):
@@ -313,10 +314,6 @@ def _cubes(centres_m: F64, half_m: float) -> F64:
     """The corners (8 N, 3) of cubes around points (N, 3)."""
     corners = ((np.arange(8)[:, None] >> np.arange(3)) & 1) * 2.0 - 1.0
     return (centres_m[:, None, :] + half_m * corners).reshape(-1, 3)
-
-
-def _is_wall(body: StaticBody) -> bool:
-    return body.kind == "wall" and max(float(p[:, 2].max()) for p in body.convex_parts_m) > _WALL_M
 
 
 def _rays_without(house: House, left_out: Sequence[StaticBody]) -> RayMesh:

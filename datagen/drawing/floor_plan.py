@@ -48,8 +48,8 @@ def draw_plan(axes: Axes, recalled: ReconstructedScene, base_xy_m: F64) -> list[
     half_m = max(1.1, float(np.abs(base_xy_m - (x, y)).max()) + 0.12)
     for room in recalled.house.house.rooms:
         axes.add_patch(Polygon(room.polygon_m, closed=True, facecolor="#f4efe6", edgecolor="#c9bfae", lw=0.5))
-    solid = [b for b in recalled.house.house.bodies if _height_m(b) > 0.01]
-    for body in sorted(solid, key=_height_m):
+    solid = [b for b in recalled.house.house.bodies if height_m(b) > 0.01]
+    for body in sorted(solid, key=height_m):
         # A stage of habitat is one body, with the floor.
         parts = [p for p in body.convex_parts_m if p[:, 2].min() < _HEAD_ROOM_M and p[:, 2].max() > 0.01]
         outlines = [convex_hull(p[:, :2].astype(np.float64)) for p in parts]
@@ -162,5 +162,6 @@ def _marker(style: Style) -> str | Path:
     return style.marker if isinstance(style.marker, str) else Path(np.array(style.marker))
 
 
-def _height_m(body: StaticBody) -> float:
+def height_m(body: StaticBody) -> float:
+    """The highest z of a body, world."""
     return max((float(p[:, 2].max()) for p in body.convex_parts_m), default=0.0)

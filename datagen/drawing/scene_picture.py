@@ -70,7 +70,6 @@ class Shown:
         return render_frame(self.spec.observation, self.recalled.geometry, self.recalled.camera, rng)
 
     def position_text(self, row: int) -> str:
-        """Position of a candidate's base as text."""
         x, y = self.samples["base_xy_m"][row]
         return f"({x:.3f}, {y:.3f}) m"
 

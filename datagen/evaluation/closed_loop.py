@@ -22,6 +22,7 @@ from datagen.evaluation.grids import (
     GridMaps,
     decisive_grids,
     grid_maps,
+    mean_of_scenes,
     method_values,
     smoothed,
 )
@@ -33,7 +34,7 @@ from datagen.replaying import places_of
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run, find_scene, open_runs
 from datagen.train.arrivals import Arrival, ring_arrival
-from datagen.train.bootstrap import Estimate, Weights, summed
+from datagen.train.bootstrap import Estimate, Weights
 from datagen.train.inputs import F64, I64, Bools
 
 # Nav2 lets a robot be off by 0.25 m and 0.25 rad.
@@ -240,7 +241,9 @@ def loop_table(
         results: dict[str, dict[str, Any]] = {}
         for (name, pick), of_pick in outcomes.items():
             ends = of_pick[e, scenes]
-            rates.setdefault(name, {})[pick] = rate = _rate(of_pick[e] == "success", scenes, weights)
+            rates.setdefault(name, {})[pick] = rate = mean_of_scenes(
+                (of_pick[e] == "success").mean(axis=1), scenes, weights, int(scenes.sum())
+            )
             causes, count = np.unique(ends[ends != "success"].astype(str), return_counts=True)
             shares = sorted(zip((count / ends.size).tolist(), causes.tolist(), strict=True), reverse=True)
             results.setdefault(name, {})[pick] = {
@@ -263,11 +266,3 @@ def loop_table(
             }
         )
     return found
-
-
-def _rate(success: npt.NDArray[Any], scenes: Bools, weights: Weights) -> Estimate:
-    """The mean over scenes of each scene's share (S, D) of successes."""
-    parts = np.column_stack([success.mean(axis=1), np.ones(len(success))]) * scenes[:, None]
-    whole, drawn = parts.sum(axis=0), summed(weights, parts)
-    with np.errstate(invalid="ignore"):  # a resample of few scenes may hold none of these
-        return Estimate(float(whole[0] / whole[1]), drawn[:, 0] / drawn[:, 1], int(scenes.sum()))

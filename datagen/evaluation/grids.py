@@ -128,8 +128,8 @@ def arrival_table(
     maps = grid_maps(columns)
     if maps is None:
         return []
-    some = np.flatnonzero((maps.truth * maps.is_clear).any(axis=(1, 2)))
-    if not len(some):
+    some: Bools = np.any(maps.truth * maps.is_clear, axis=(1, 2), keepdims=True)[:, 0, 0]
+    if not some.any():
         return []
     raw = {m.name: columns.scores[m.name][maps.order] for m in methods}
     chances = {m.name: method_values(raw[m.name], maps, m) for m in methods}
@@ -150,7 +150,9 @@ def arrival_table(
                 "best": float(np.nanmax(offered[some], axis=(1, 2)).mean()),
                 "any": float(np.nanmean(offered[some], axis=(1, 2)).mean()),
                 "methods": {
-                    name: {pick: _mean(value, some, weights).values() for pick, value in by_pick.items()}
+                    name: {
+                        pick: mean_of_scenes(value, some, weights).values() for pick, value in by_pick.items()
+                    }
                     for name, by_pick in per_scene.items()
                 },
             }
@@ -183,8 +185,8 @@ def _picked(value: F64, truth: F64, is_clear: Bools) -> F64:
     return (truth * top).sum(axis=(1, 2)) / np.maximum(top.sum(axis=(1, 2)), 1)
 
 
-def _mean(value: F64, some: Any, weights: Weights) -> Estimate:
-    parts = np.zeros((len(value), 2))
-    parts[some] = np.column_stack([value[some], np.ones(len(some))])
+def mean_of_scenes(value: F64, some: Bools, weights: Weights, trials: int = 0) -> Estimate:
+    """The mean of values (S,) over some of the scenes."""
+    parts = np.column_stack([value, np.ones(len(value))]) * some[:, None]
     whole, drawn = parts.sum(axis=0), summed(weights, parts)
-    return Estimate(float(ratio(whole[0], whole[1])), ratio(drawn[..., 0], drawn[..., 1]))
+    return Estimate(float(ratio(whole[0], whole[1])), ratio(drawn[..., 0], drawn[..., 1]), trials)

@@ -72,7 +72,10 @@ class EvaluatedMethod:
         """Key of the training, to compare models that differ in one part of it."""
         if self.head is None:
             return NO_TRAINING
-        return TrainedBy(self.regime, self.head.model, house_share(self.head))
+        share = self.head.options.get("house_share")
+        return TrainedBy(
+            self.regime, self.head.model, float(share) if isinstance(share, int | float) else 1.0
+        )
 
     @property
     def recipe(self) -> str:
@@ -89,7 +92,6 @@ class EvaluatedMethod:
 
     @property
     def method(self) -> Method:
-        """The method for the metrics."""
         is_probability = isinstance(self.scorer, (ModelScorer, ProgramScorer, Scalars)) or (
             isinstance(self.scorer, ScoreFile) and self.scorer.gives_probabilities
         )
@@ -317,9 +319,3 @@ def score_runs(
     reached = (k for k, run in enumerate(runs) if all(s.candidates.in_range_by for s in run.specs))
     columns = replace(columns, reached_runs=tuple(reached))
     return columns, {name: 600 * spent_s / len(columns) for name, spent_s in seconds.items()}
-
-
-def house_share(head: CheckpointHead) -> float:
-    """Share of the available houses that the model was trained on."""
-    share = head.options.get("house_share", 1.0)
-    return float(share) if isinstance(share, (int, float)) else 1.0

@@ -75,7 +75,6 @@ def _accuracy(report: Report, scores: Report) -> Table:
 
 
 def _comparisons(comparisons: Sequence[Report], where: str) -> Table:
-    """Paired differences of regimes, and of the best model and baseline."""
     rows = [
         (
             f"{d['first']} - {d['second']}",

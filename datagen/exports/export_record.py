@@ -59,11 +59,6 @@ def run_digest(runs: Sequence[Run]) -> str:
     return digest.hexdigest()
 
 
-def address_from(run: Storage, out: Storage) -> str:
-    """The address of a run as its export's record has it."""
-    return run.url if run.folder is None or out.folder is None else os.path.relpath(run.folder, out.folder)
-
-
 def is_intact(storage: Storage, file: FileEntry) -> bool:
     """Whether an exported file has its recorded bytes."""
     data = storage.get(file.path, MAX_FILE_BYTES)

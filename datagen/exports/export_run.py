@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -16,7 +17,6 @@ from datagen.exports import FORMATS
 from datagen.exports.export_record import (
     ExportedFile,
     ExportRecord,
-    address_from,
     is_intact,
     read_export,
     refuse_other_export,
@@ -58,7 +58,6 @@ class Made:
     files: Sequence[ExportedFile]
 
     def sums(self, *counts: str) -> list[int]:
-        """Sums of counts over all files."""
         return [sum(file.counts.get(name, 0) for file in self.files) for name in counts]
 
 
@@ -133,7 +132,6 @@ class ExportSource:
 
 
 def _cut(place: ShardPlace, low: int, high: int) -> ShardPlace:
-    """A shard's wanted scenes `low` to `high`."""
     each, rows = place.full_samples // place.full_scenes, place.rows
     samples = min(high * each, rows.samples) - low * each
     return replace(place, rows=Rows(rows.first + low, high - low, samples))
@@ -177,7 +175,7 @@ def export_run(
     wanted = ExportRecord(
         format=to,
         version=__version__,
-        run=address_from(run, storage),
+        run=os.path.relpath(run.folder, storage.folder) if run.folder and storage.folder else run.url,
         run_sha256=run_digest(source.runs),
         spec_hashes=tuple(each.manifest.spec_hash for each in source.runs),
         scenes=(source.first, source.past),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -52,14 +51,12 @@ def _table(
     fields_of, _shards, batch_of = _TABLES[table]
     fields = fields_of(source)
     batches = [batch_of(shard, fields) for shard in shards]  # read once for all splits
+    splits = [np.array(batch.column("split").to_pylist()) for batch in batches]
     for ours, theirs in _SPLITS.items():
-        data, counts = parquet_of(fields, (_of_split(batch, ours) for batch in batches), source)
+        rows = (b.take(np.flatnonzero(s == ours)) for b, s in zip(batches, splits, strict=True))
+        data, counts = parquet_of(fields, rows, source)
         if counts["rows"]:
             yield NewFile(f"{table}/{theirs}-{number:05d}.parquet", data, counts)
-
-
-def _of_split(batch: Any, split: str) -> Any:
-    return batch.take(np.flatnonzero(np.array(batch.column("split").to_pylist()) == split))
 
 
 def _documents(source: ExportSource, made: Made) -> Iterator[NewFile]:
@@ -130,7 +127,6 @@ def _body(
 
 
 def _splits(table: str, files: Sequence[ExportedFile]) -> list[tuple[str, list[ExportedFile]]]:
-    """Splits of a table that have rows, with their files."""
     found = {s: [f for f in files if f.path.startswith(f"{table}/{s}-")] for s in _SPLITS.values()}
     return [(split, mine) for split, mine in found.items() if mine]
 

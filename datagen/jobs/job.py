@@ -82,14 +82,7 @@ class JobOptions:
             refuse_unusable(self.address)
 
     def display(self) -> Progress:
-        """The display of progress on standard error."""
         return Progress(self.json, console=Console(file=io.StringIO()) if self.quiet else None)
-
-
-def refuse_odd_n(n: int) -> None:
-    """Raise InputError for a number of labels out of range."""
-    if not 1 <= n <= 10**12:
-        raise InputError("--n", str(n), "is not between 1 and 10^12", "Give the number of labels wanted")
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,11 +146,9 @@ class Job:
         return result
 
     def missing(self) -> list[ShardRanges]:
-        """The shards of each run that are to be made."""
         return [job_run.run.missing() for job_run in self.runs]
 
     def record(self, missing: Sequence[ShardRanges]) -> JobRecorder:
-        """Publish the job's record."""
         command, shards = ("datagen", *self.command), sum(map(len, missing))
         return JobRecorder(Jobs(self.storage), command, self.options.address, shards)
 

@@ -116,7 +116,6 @@ def _open_target(storage: Storage, source: Run, spec: Specification) -> Run:
 def _relabel_shards(
     run: Run, source: Run, missing: Sequence[int], stop: StopRequest, shown: Progress
 ) -> JobSummary:
-    """Relabel the shards of one run in this process."""
 
     def work(task: AttemptOrder, meter: Meter) -> AttemptResult:
         return relabel_shard(run, source, task, meter)

@@ -30,15 +30,12 @@ Options = TypeVar("Options", bound=Any)  # a dataclass of options
 
 def with_absolute_paths(options: Options) -> Options:
     """The options with absolute paths and sources: workers run elsewhere."""
-    changed: dict[str, str] = {}
-    for name in ("out", "houses", "objects", "scenes_from", "config"):
-        if (value := getattr(options, name, None)) is not None:
-            make = absolute_source if name in ("houses", "objects") else absolute_path
-            changed[name] = make(value)
-    robot = getattr(options, "robot", None)
-    if robot is not None:
-        changed["robot"] = absolute_robot(robot)
-    return replace(options, **changed)
+    makers = dict.fromkeys(("out", "scenes_from", "config"), absolute_path)
+    makers |= {"houses": absolute_source, "objects": absolute_source, "robot": absolute_robot}
+    given = {name: getattr(options, name, None) for name in makers}
+    return replace(
+        options, **{name: makers[name](value) for name, value in given.items() if value is not None}
+    )
 
 
 def words_to_resume(path: str, options: JobOptions, moved: Sources = AS_FOUND) -> list[str]:

@@ -48,7 +48,6 @@ def audit_runs(runs: Sequence[Run]) -> dict[str, Any]:
 def _source(
     source: str, labels: Sequence[Labels], spending: Spending, scenes_s: float | None
 ) -> dict[str, Any]:
-    """The record of the runs of one label source; `scenes_s` is that of `_scenes_s`."""
     useful, wasted = spending.useful, spending.wasted
     near = sum(int(each.within_reach.sum()) for each in labels)
     near_positive = sum(int((each.within_reach & each.label).sum()) for each in labels)
@@ -141,7 +140,6 @@ class Account:
     peak_rss_bytes: int = 0
 
     def add(self, cost: Cost | None) -> None:
-        """Add one attempt."""
         self.attempts += 1
         if cost is None:
             self.unknown += 1

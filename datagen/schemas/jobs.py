@@ -119,7 +119,6 @@ class Jobs:
             self._storage.put(f"jobs/{job}.stop", b"now" if at_once else b"drain", durably=False)
 
     def stop_of(self, job: str) -> Stop | None:
-        """The request to stop a job; None for none."""
         data = self._storage.get(f"jobs/{job}.stop", MAX_RECORD_BYTES)
         return "now" if data == b"now" else "drain" if data == b"drain" else None
 

@@ -206,9 +206,6 @@ class Ledger:
         self._storage.put(key, encode_record(kept))
         return True
 
-    def attempts(self) -> set[str]:
-        return {name.removesuffix(".start") for name in self._names()}
-
     def start_of(self, attempt: str) -> AttemptStart | None:
         return read_record(self._storage, start_key(attempt), AttemptStart)
 

@@ -56,6 +56,12 @@ _MOST_REMEMBERED = 10_000  # commits, of 3 kB each
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
 
 
+def refuse_odd_n(n: int) -> None:
+    """Raise InputError for a number of labels out of range."""
+    if not 1 <= n <= MOST_SAMPLES:
+        raise InputError("--n", str(n), "is not between 1 and 10^12", "Give the number of labels wanted")
+
+
 class Rows(NamedTuple):
     """The rows of a shard that count: `scenes` from its scene `first` on, and their samples."""
 
@@ -158,8 +164,7 @@ class Run:
 
     def grow(self, n: int, created: str | None = None) -> None:
         """Raise the wanted samples to n; a run never shrinks. `created` is the plan's time [now]."""
-        if not 1 <= n <= MOST_SAMPLES:
-            raise InputError("--n", str(n), "is not between 1 and 10^12", "Give the number of samples wanted")
+        refuse_odd_n(n)
         while (newest := self.plan()) is None or newest.n < n:
             number, spec_hash = newest.number + 1 if newest else 1, self.manifest.spec_hash
             plan = Plan(n=n, created=created or utc_now(), spec_hash=spec_hash, number=number)
@@ -308,7 +313,6 @@ class Run:
 
     @property
     def command_for_missing(self) -> str:
-        """The command that makes the shards that are missing."""
         more = " --quarantined" if self.quarantined() else ""
         return f"datagen resume {self.storage.url}{more}"
 

@@ -145,7 +145,6 @@ class FileEntry(StoredRecord):
 
     @classmethod
     def of(cls, path: str, data: bytes) -> FileEntry:
-        """The entry of a file with these bytes."""
         return cls(path=path, size=len(data), sha256=sha256(data).hexdigest())
 
 
@@ -169,7 +168,6 @@ class Cost(StoredRecord):
 
     @model_serializer(mode="wrap")
     def _without_empty_source(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit `source_s` where empty."""
         return {name: value for name, value in plain(self).items() if name != "source_s" or value}
 
     @property

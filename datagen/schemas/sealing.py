@@ -293,7 +293,6 @@ class ArrayFiles:
         self._pending = [rest.copy()] if len(rest) else []
 
     def close(self) -> Iterator[tuple[str, bytes]]:
-        """Fill the last chunk, and yield the last file."""
         if self._pending:
             missing = self._array.chunk_rows - len(self._pending[0])
             shape = (missing, *self._array.shape[1:])

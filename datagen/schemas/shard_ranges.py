@@ -93,7 +93,6 @@ class ShardRanges(Sequence[int]):
         return int(self.bounds[row, 1] - (self._ends[row] - at))
 
     def position_of(self, shard: int) -> int:
-        """The position of one of its shards, in ascending order."""
         row = int(np.searchsorted(self.bounds[:, 1], shard, side="right"))
         return int(self._ends[row] - (self.bounds[row, 1] - shard))
 

@@ -185,12 +185,9 @@ class ShardPlace:
         }
 
     def _computed(self, array: StoredArray, read: Mapping[str, Array]) -> Array:
-        if array.name == "base_yaw_rad":
-            return self._facing(read)
-        return np.zeros(len(read[array.computed_from[0].name]), array.dtype)
-
-    def _facing(self, read: Mapping[str, Array]) -> Array:
-        """Headings that face the target: those of stores without headings."""
+        if array.name != "base_yaw_rad":
+            return np.zeros(len(read[array.computed_from[0].name]), array.dtype)
+        # Bases of stores without headings face the target.
         scene = np.arange(self.samples) // (self.full_samples // self.full_scenes)
         return facing_rad(read["target_center_m"][scene, :2] - read["base_xy_m"]).astype(np.float32)
 

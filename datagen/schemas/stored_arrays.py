@@ -64,7 +64,6 @@ class StoredArray:
         return self.dtype == "string"
 
     def path(self, index: int) -> str:
-        """Path of a chunk, or of a file of chunks."""
         return chunk_path(self.name, index, len(self.shape) - 1)
 
 

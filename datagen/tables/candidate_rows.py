@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,38 +22,30 @@ from datagen.workers.houses import split_of
 Array = npt.NDArray[Any]
 
 
+@dataclass(frozen=True, eq=False)
 class _Rows:
     """One shard's columns by the names of the table, one row per candidate."""
 
-    def __init__(
-        self, part: RunPart, shard: ShardPlace, columns: Columns, scene: npt.NDArray[np.int64]
-    ) -> None:
-        self._part, self._shard, self._columns, self._scene = part, shard, columns, scene
-
-    def __len__(self) -> int:
-        return len(self._scene)
+    part: RunPart
+    shard: ShardPlace
+    columns: Columns
+    scene: npt.NDArray[np.int64]  # row of each candidate's scene
 
     def stored(self, name: str) -> Array:
         """A stored array; values of a scene are repeated for each of its candidates."""
-        values = self._columns[name]
-        return values[self._scene] if self._part.arrays[name].dims[0] == "scene" else values
+        values = self.columns[name]
+        return values[self.scene] if self.part.arrays[name].dims[0] == "scene" else values
 
     def one(self, value: Any) -> Array:
-        return np.full(len(self), value, None if isinstance(value, float) else object)
+        return np.full(len(self.scene), value, None if isinstance(value, float) else object)
 
     def robot(self) -> Array:
-        names = {None if spec.arm is None else spec.arm.robot for spec in self._part.specs}
+        names = {None if spec.arm is None else spec.arm.robot for spec in self.part.specs}
         return self.one(names.pop() if len(names) == 1 else None)
 
     def split(self) -> Array:
-        houses = self._columns["house_id"]
-        return np.array([split_of(str(house)) for house in houses], object)[self._scene]
-
-    def run(self) -> Array:
-        return self.one(self._part.place)
-
-    def cost(self) -> Array:
-        return self.one(self._shard.wall_s_per_sample)
+        houses = self.columns["house_id"]
+        return np.array([split_of(str(house)) for house in houses], object)[self.scene]
 
     def from_target(self, axis: int) -> Array:
         return self.stored("base_xy_m")[:, axis] - self.stored("target_center_m")[:, axis]
@@ -60,7 +53,7 @@ class _Rows:
 
 # Columns that are not arrays of the store: the arrays that each is made from, and how.
 DERIVED: Mapping[str, tuple[tuple[str, ...], Callable[[_Rows], Array]]] = {
-    "run": ((), _Rows.run),
+    "run": ((), lambda rows: rows.one(rows.part.place)),
     "house": (("house_id",), lambda rows: rows.stored("house_id")),
     "split": (("house_id",), _Rows.split),
     "object": (("object_name",), lambda rows: rows.stored("object_name")[:, 0]),
@@ -73,7 +66,7 @@ DERIVED: Mapping[str, tuple[tuple[str, ...], Callable[[_Rows], Array]]] = {
     "target_x_world_m": (("target_center_m",), lambda rows: rows.stored("target_center_m")[:, 0]),
     "target_y_world_m": (("target_center_m",), lambda rows: rows.stored("target_center_m")[:, 1]),
     "target_z_world_m": (("target_center_m",), lambda rows: rows.stored("target_center_m")[:, 2]),
-    "cost_s": ((), _Rows.cost),
+    "cost_s": ((), lambda rows: rows.one(rows.shard.wall_s_per_sample)),
     "sample_id": (
         ("sample_id",),
         lambda rows: np.array([row.tobytes().hex() for row in rows.stored("sample_id")]),

@@ -101,7 +101,6 @@ class EncodedBatches:
         self.batches_per_epoch = max(1, -(-len(scenes) // scenes_per_batch))
 
     def epoch(self, k: int, skip_batches: int = 0) -> Iterator[Batch[Array]]:
-        """Batches of epoch k from batch `skip_batches` on."""
         order = self._scenes
         if self._seed is not None:
             order = np.random.default_rng([self._seed, k]).permutation(order)

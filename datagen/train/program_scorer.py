@@ -158,7 +158,6 @@ class Function:
         return dropped
 
     def run(self, constants: Mapping[str, Array], inputs: Mapping[str, Array]) -> list[Array]:
-        """The outputs for inputs by name."""
         known: dict[str, Any] = {**constants, **inputs}
         for step, dropped in zip(self.steps, self._dropped, strict=True):
             known[step.name] = OPERATIONS[step.op](*_filled(step.args, known), **_filled(step.options, known))
@@ -176,7 +175,6 @@ class Program:
     facts: Mapping[str, Any]
 
     def run(self, function: str, inputs: Mapping[str, Array]) -> list[Array]:
-        """The outputs of one function."""
         return self.functions[function].run(self.constants, inputs)
 
 

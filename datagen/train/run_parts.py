@@ -108,7 +108,6 @@ def _words(array: StoredArray) -> str:
 
 
 def _open(path: Path | str, names: Sequence[str], allow_incomplete: bool) -> list[RunPart]:
-    """The parts of a run, of merged runs, or of a sealed store."""
     if is_sealed_store(path):
         return [open_sealed(path, names)]
     storage = open_storage(path, probe=False, create=False)

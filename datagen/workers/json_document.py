@@ -51,7 +51,6 @@ class JsonNode(NamedTuple):
             yield JsonNode(self.place, f"{self.path}[{i}]", value)
 
     def number(self, low: float, high: float) -> float:
-        """A finite number within [low, high]."""
         value = self.value
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise self.error(f"is {_kind(value)}, not a number")
@@ -61,7 +60,6 @@ class JsonNode(NamedTuple):
         return float(value)
 
     def numbers(self, count: int, low: float, high: float) -> list[float]:
-        """A list of `count` numbers within [low, high]."""
         values = [item.number(low, high) for item in self.items(count)]
         if len(values) != count:
             raise self.error(f"has {len(values)} numbers, not {count}")

@@ -70,12 +70,3 @@ def open_source(registry: Mapping[str, str], ref: str, option: str) -> Any:
         kind = outside[1]
         text = ref[len(kind) + 1 :]
     return entry(registry, kind, option)(text)
-
-
-def can_import(registry: Mapping[str, str], name: str) -> bool:
-    """Whether an entry's module can be imported on this machine."""
-    try:
-        import_module(registry[name].split(":")[0])
-    except ImportError:
-        return False
-    return True

@@ -13,13 +13,11 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.specification import PlaceKind, Specification
 from datagen.workers.bases.clearance import HouseObstacles
 from datagen.workers.content_cache import CacheFolder
-from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses import ids_of_split, open_houses
 from datagen.workers.houses.house import House, HouseSource
 from datagen.workers.objects import open_objects
 from datagen.workers.objects.convex import GRIPPER_VERSION
 from datagen.workers.objects.model import ObjectModel, ObjectSource
-from datagen.workers.rendering.embree import RayMesh, RayScene, house_rays, object_rays
 from datagen.workers.robots import remember
 
 if TYPE_CHECKING:
@@ -35,11 +33,6 @@ class PreparedHouse:
     """A house and the geometry derived from it, built on first use: many tries end before."""
 
     house: House
-
-    @property
-    def rays(self) -> RayMesh:
-        """The ray hierarchy over the whole house."""
-        return house_rays(self.house)
 
     @cached_property
     def obstacles(self) -> HouseObstacles:
@@ -116,12 +109,6 @@ class World:
         assert self.spec.arm is not None
         gripper = gripper_of(self.spec.arm.robot_key)
         return Targets(self.object_names, self.objects.load, gripper, self.spec.arm.grasps)
-
-    def ray_scene(self, house: PreparedHouse, names: list[str], T_world_object: F64) -> RayScene:
-        """A house with the named objects at these poses (K, 4, 4), ready for rays."""
-        models = [self.object(name) for name in names]
-        radii_m = np.array([model.radius_m for model in models])
-        return RayScene(house.rays, [object_rays(model) for model in models], radii_m, T_world_object)
 
 
 def _target_names(objects: ObjectSource) -> list[str]:

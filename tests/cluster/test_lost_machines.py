@@ -60,7 +60,7 @@ def test_an_executor_that_loses_everything_ends_the_job_and_is_no_shards_fault(s
         return ("committed", 5.0) if 0 < made <= 3 else ("lost", 0.01)
 
     summary, recorder, executor = on_one_machine(shards, fate)
-    assert summary.end == "aborted" and summary.exit_code == 2 and not recorder.given_up
+    assert summary.end == "aborted" and not recorder.given_up
     assert summary.cause == "every attempt is lost, the last by: scripted lost"
     assert summary.remaining == shards - summary.totals.committed and len(executor.orders) < 60
 

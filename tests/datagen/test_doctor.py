@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from datagen import cli, doctor
-from datagen.doctor import Check, Finding, found, probe
+from datagen.doctor import Check, Finding, Problem, found, probe
 from datagen.workers.extras import EXTRAS, how_to_get
 
 
@@ -23,9 +23,10 @@ from datagen.workers.extras import EXTRAS, how_to_get
     ],
 )
 def test_a_probe_survives_what_it_probes(code: str, said: str) -> None:
-    answer = probe(code, timeout_s=0.4 if "sleep" in code else 60)
-    assert (answer.succeeded, answer.text) == (False, said)
-    assert probe("print('first'); print('last')").text == "last"
+    with pytest.raises(Problem) as failed:
+        probe(code, timeout_s=0.4 if "sleep" in code else 60)
+    assert str(failed.value) == said
+    assert probe("print('first'); print('last')") == "last"
 
 
 def findings(*names: str) -> dict[str, Finding]:

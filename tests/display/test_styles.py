@@ -60,13 +60,15 @@ def distance(a: str, b: str, eye: str) -> float:
     return float(np.linalg.norm(seen_as(a, eye) - seen_as(b, eye)))
 
 
-def test_every_outcome_has_a_style_of_its_own_and_one_stage_is_one_group() -> None:
+def test_every_outcome_has_a_style_of_its_own_and_one_stage_has_one_marker() -> None:
     assert tuple(OUTCOME_STYLES) == tuple(OUTCOMES)
     for key in ("colour", "words"):
         assert len({getattr(style, key) for style in OUTCOME_STYLES.values()}) == len(OUTCOME_STYLES)
-    groups = [style.group for style in OUTCOME_STYLES.values()]
+    groups = [style.marker for style in OUTCOME_STYLES.values()]
     assert groups == sorted(groups, key=groups.index)  # members of a group follow each other
-    of_stages = {(stage, OUTCOME_STYLES[name].group) for name, stage in OUTCOMES.items() if name != "success"}
+    of_stages = {
+        (stage, OUTCOME_STYLES[name].marker) for name, stage in OUTCOMES.items() if name != "success"
+    }
     assert len(of_stages) == len({stage for stage, _ in of_stages})
 
 

@@ -16,7 +16,7 @@ from datagen.cluster import ray_nodes
 from datagen.cluster.attempt_guard import Meter, notes_of_a_job
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.job_monitor import JobProgress
-from datagen.cluster.protocol import AttemptResult, StopRequest, stop_on_signals
+from datagen.cluster.protocol import EXIT_CODES, AttemptResult, StopRequest, stop_on_signals
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import ray_executor
 from datagen.cluster.run_recorder import RunRecorder
@@ -73,7 +73,7 @@ def main() -> int:
         "outcomes": summary.totals.outcomes,
     }
     print(json.dumps(said))
-    return summary.exit_code
+    return EXIT_CODES.get(summary.end, 0)
 
 
 if __name__ == "__main__":

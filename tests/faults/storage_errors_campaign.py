@@ -23,7 +23,7 @@ from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from tests.faults.crash_points_operations import damage, small_schema, units
-from tests.made_runs import attempt, make_run
+from tests.made_runs import attempt, attempts_of, make_run
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 _CALLS = ("openat", "read", "write", "fsync", "renameat2", "rename", "renameat", "link", "linkat", "mkdir",
@@ -86,7 +86,7 @@ def program(words: list[str]) -> int:
     try:
         run = Run.open(words[1])
         if 1 not in run.committed():
-            attempt(run, 1, f"b-{len(run.ledger.attempts())}")
+            attempt(run, 1, f"b-{len(attempts_of(run))}")
         run.close_lost_attempts()  # as every driver does
     except InputError as error:
         sys.stderr.write(f"error: {error}\n")

@@ -22,7 +22,7 @@ from datagen.schemas.run import Run, open_runs
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage, open_storage
 from tests.faults.crash_points_operations import remake
-from tests.made_runs import attempt, files_of, flip, make_run, write
+from tests.made_runs import attempt, attempts_of, files_of, flip, make_run, write
 from tests.schemas.checked import (
     assert_rows,
     fill,
@@ -158,7 +158,7 @@ def test_garbage_is_removed_and_all_else_keeps_its_bytes(place: str, tmp_path: P
     cleaned = clean_runs(run.storage, kept_s=-HOUR_S)
     assert cleaned.files == len(garbage) and cleaned.bytes > 0
     assert tree(run.storage) == before and not (tmp_path / "run" / "data-2.zarr").exists()
-    assert len(run.ledger.attempts()) == 5  # all are kept
+    assert len(attempts_of(run)) == 5  # all are kept
     assert clean_runs(run.storage, kept_s=-HOUR_S).files == 0 and found(run.storage.url) == []
 
 

@@ -20,7 +20,7 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout, LedgerEntry, QuarantineRecord, StageClock
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import open_storage
-from tests.made_runs import files_of, make_run, manifest_of, small_spec, write
+from tests.made_runs import attempts_of, files_of, make_run, manifest_of, small_spec, write
 from tests.schemas.checked import edit
 
 pytestmark = pytest.mark.usefixtures("few_arrays")
@@ -126,7 +126,7 @@ def test_the_ledger_knows_who_began_and_who_never_ended(tmp_path: Path) -> None:
     (entry,) = run.ledger.ends()
     assert (entry.outcome, len(entry.stack)) == ("crashed", 20_000)
     assert [s.attempt for s in run.ledger.unfinished({"c"})] == ["b"]
-    assert run.ledger.end(end.model_copy(update={"attempt": "d"})) and run.ledger.attempts() == set("abcd")
+    assert run.ledger.end(end.model_copy(update={"attempt": "d"})) and attempts_of(run) == set("abcd")
 
 
 def test_other_names_in_commits_do_not_count(tmp_path: Path) -> None:

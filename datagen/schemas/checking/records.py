@@ -80,7 +80,6 @@ def open_roots(storage: Storage) -> tuple[list[Run], list[Finding]]:
 
 
 def _merged_parts(storage: Storage) -> tuple[tuple[MergedPart, ...] | None, list[Finding]]:
-    """The parts, or None where these are not merged runs."""
     ours, copy = read(storage, MERGED, Merged), read(storage, copy_key(MERGED), Merged)
     merged = sound(ours, copy)
     if merged is not None:

@@ -197,7 +197,6 @@ def _address(path: str) -> str:
 
 
 def _refuse_nested(paths: Sequence[str], out: str, existing: Sequence[Run], sources: Sequence[Run]) -> None:
-    """Raise InputError where the result is inside a source or a source inside the result."""
     here, roots = _address(out), {_address(path) for path in paths}
     known = {here, *map(identity, existing)}
     for other in sorted({*roots, *map(identity, sources)} - known):

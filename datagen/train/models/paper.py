@@ -75,7 +75,6 @@ class PointMlp(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, rows: Tensor) -> Tensor:
-        """Features of rows."""
         flat = rows.flatten(0, -2)
         alone = self.training and len(flat) == 1
         if alone:
@@ -112,7 +111,6 @@ class PaperModel(Model):
 
     @property
     def logit_layer(self) -> nn.Module:
-        """The last layer of the head."""
         return self.head[-1]
 
     def forward(

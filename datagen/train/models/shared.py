@@ -17,7 +17,7 @@ candidate's line to the target: the mean over both sides is taken.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -111,11 +111,6 @@ def with_reach(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {**weights, name: torch.nn.functional.pad(weights[name], (0, missing))}
 
 
-def mlp(width_in: int, widths: Sequence[int], width_out: int) -> nn.Sequential:
-    """`layers`, and a linear one."""
-    return nn.Sequential(*layers(width_in, widths), nn.Linear(widths[-1] if widths else width_in, width_out))
-
-
 class SharedModel(Model):
     """Tokens of a robot's cloud in each candidate's frame."""
 
@@ -154,16 +149,16 @@ class SharedModel(Model):
         if self.sizes.hand_poses:
             self.hands = HandPooling(n_scalars, width, N_CODES * self.sizes.kinematics)
             joined += 3 * width
+        head = self.sizes.head
         self.head = nn.Sequential(
             nn.LayerNorm(joined),
             nn.ReLU(),
             nn.Dropout(self.sizes.dropout),
-            mlp(joined, self.sizes.head, 2),
+            nn.Sequential(*layers(joined, head), nn.Linear(head[-1] if head else joined, 2)),
         )
 
     @property
     def logit_layer(self) -> nn.Module:
-        """The last layer of the head."""
         return list(self.head.modules())[-1]
 
     def forward(

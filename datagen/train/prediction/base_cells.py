@@ -26,7 +26,6 @@ CLEAR, BLOCKED, UNSEEN, UNREACHABLE = STATES = ("clear", "blocked", "unseen", "u
 SEEN_SHARE = 0.8
 # One stray pixel of a stereo camera is no obstacle.
 _LEAST_POINTS = 3
-_CELL_M = CELL_M
 _GAP_CELLS = 4  # gaps up to twice as wide are closed
 # Boards of tables and shelves reach about this far below their visible top.
 _BOARD_M = 0.08
@@ -47,7 +46,6 @@ class RobotSize:
 
     @property
     def outline(self) -> Footprint:
-        """Outline of the base."""
         if self.footprint is not None:
             return self.footprint
         return Footprint(float(CandidateParams(scaled_base=True).radius_of_base_m(self.arm_reach_m)))
@@ -59,7 +57,6 @@ class BaseCells:
 
     offset_m: F32  # (N, 2), from the target's centre, world axes
     state: I64  # (N,), index into STATES
-    way: I64  # (N,), index into WAYS: how the base gets there from the camera
 
 
 def headings(offset_m: F32, robot: RobotSize) -> F64:
@@ -122,13 +119,13 @@ def observe_cells(
     state[(share >= SEEN_SHARE) & (way == WAYS.index("seen"))] = STATES.index(CLEAR)
     state[way == WAYS.index("none")] = STATES.index(UNREACHABLE)
     state[blocked] = STATES.index(BLOCKED)
-    return BaseCells(offsets.astype(np.float32), state, way)
+    return BaseCells(offsets.astype(np.float32), state)
 
 
 def seen_share(cloud_m: F32, radius_m: float) -> float:
     """Share of the disc around the target, from above, with a point of the cloud (N, 3, target frame)."""
     n, cell_m = int(np.ceil(radius_m / 0.05)), 0.05
-    hit = _occupied(cloud_m, np.full(2, -n * cell_m), cell_m, (2 * n, 2 * n))
+    hit = counted(cloud_m, np.full(2, -n * cell_m), cell_m, (2 * n, 2 * n)) > 0
     centres = (np.arange(2 * n) + 0.5 - n) * cell_m
     return float(hit[np.hypot(*np.meshgrid(centres, centres)) <= radius_m].mean())
 
@@ -164,33 +161,28 @@ def _turned(points_m: F64, yaw: F64) -> F64:
     return np.stack([c * x - s * y, s * x + c * y], axis=2)
 
 
-def _occupied(points_m: F32, low: F64, cell_m: float, size: tuple[int, int]) -> Bools:
-    """Cells (size) of a grid on the floor, from corner `low` (2,), with a point (N, 3) above or in them."""
-    return counted(points_m, low, cell_m, size) > 0
-
-
 def _in_shadow(tops_m: F32, base_xy: F64) -> Bools:
     """Mask (N,) of bases in a gap of a surface above the mount: an object there hides the surface."""
-    n = int(2 * _AROUND_M / _CELL_M)
+    n = int(2 * _AROUND_M / CELL_M)
     low = base_xy.mean(axis=0) - _AROUND_M
-    closed = ndimage.binary_closing(_occupied(tops_m, low, _CELL_M, (n, n)), iterations=_GAP_CELLS)
-    rows = np.clip(np.floor((base_xy - low) / _CELL_M).astype(np.int64), 0, n - 1)
+    closed = ndimage.binary_closing(counted(tops_m, low, CELL_M, (n, n)) > 0, iterations=_GAP_CELLS)
+    rows = np.clip(np.floor((base_xy - low) / CELL_M).astype(np.int64), 0, n - 1)
     return np.asarray(closed, np.bool_)[rows[:, 0], rows[:, 1]]
 
 
 def _floor_share(floor_m: F32, base_xy: F64, yaw: F64, base: Footprint) -> F64:
     """Share (N,) of the cells under each base in which floor was seen."""
-    low = base_xy.min(axis=0) - base.radius_m - _CELL_M
-    size = np.ceil((base_xy.max(axis=0) + base.radius_m + _CELL_M - low) / _CELL_M).astype(np.int64) + 1
-    seen = _occupied(floor_m, low, _CELL_M, (int(size[0]), int(size[1])))
+    low = base_xy.min(axis=0) - base.radius_m - CELL_M
+    size = np.ceil((base_xy.max(axis=0) + base.radius_m + CELL_M - low) / CELL_M).astype(np.int64) + 1
+    seen = counted(floor_m, low, CELL_M, (int(size[0]), int(size[1]))) > 0
     # Far away, rows of pixels are farther apart than cells are wide.
     seen |= np.asarray(ndimage.binary_closing(seen), np.bool_)
-    n = int(np.ceil(base.radius_m / _CELL_M))
-    step = np.arange(-n, n + 1) * _CELL_M
+    n = int(np.ceil(base.radius_m / CELL_M))
+    step = np.arange(-n, n + 1) * CELL_M
     under: F64 = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2).astype(np.float64)
     under = under[base.holds(under)]
     below = _turned(under, yaw) if base.corners_m else under  # a circle is the same at every heading
-    rows = np.floor((base_xy[:, None] + below - low) / _CELL_M).astype(np.int64)  # (N, D, 2)
+    rows = np.floor((base_xy[:, None] + below - low) / CELL_M).astype(np.int64)  # (N, D, 2)
     rows = np.clip(rows, 0, size - 1)
     return seen[rows[..., 0], rows[..., 1]].mean(axis=1)
 

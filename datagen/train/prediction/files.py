@@ -15,7 +15,7 @@ from datagen.schemas.safe_files import DAMAGED_ARRAY, DAMAGED_ZIP, open_member, 
 from datagen.train.inputs import F32, F64, U8, Array, Bools
 from datagen.workers.geometry.transforms import is_pose
 from datagen.workers.image_file import FILE_FIX, MAX_FILE_BYTES, MAX_PIXELS, opened
-from datagen.workers.json_document import JsonNode, parse_json
+from datagen.workers.json_document import parse_json
 
 _MAX_JSON_BYTES = 2**20
 # The largest entry of R R^T - I: poses are often text of four or five digits.
@@ -107,7 +107,8 @@ def valid_depth(depth_m: F32) -> F32:
 
 def read_pose(path: Path) -> F64:
     """`T_world_camera` (4, 4): the value of that key, or the whole document; rows of four numbers."""
-    node = _document(path)
+    data = read_regular(path, _MAX_JSON_BYTES, "Name a readable JSON file of at most 1 MiB")
+    node = parse_json(data, str(path))
     if isinstance(node.value, dict):
         node = node.get("T_world_camera")
     rows = [[cell.number(-1e9, 1e9) for cell in row.items(4)] for row in node.items(4)]
@@ -174,9 +175,3 @@ def _array(path: Path, name: str, data: bytes) -> Array:
         raise InputError(path, name, f"has {len(data) - file.tell():,} of {size:,} bytes", _NPZ_FIX)
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False)
-
-
-def _document(path: Path) -> JsonNode:
-    return parse_json(
-        read_regular(path, _MAX_JSON_BYTES, "Name a readable JSON file of at most 1 MiB"), str(path)
-    )

@@ -103,8 +103,8 @@ def ways_to(
     way = np.full(len(goals_m), WAYS.index("none"))
     at = floor_map.rows(goals_m)
     # A cell's middle is up to 0.7 of its side from a base's.
-    way[_within(open_ways, slack_m + CELL_M)[at] & ~hidden[at]] = WAYS.index("unseen")
-    way[_within(seen_ways, slack_m + CELL_M)[at] & ~hidden[at]] = WAYS.index("seen")
+    way[(_distance_m(open_ways)[at] <= slack_m + CELL_M) & ~hidden[at]] = WAYS.index("unseen")
+    way[(_distance_m(seen_ways)[at] <= slack_m + CELL_M) & ~hidden[at]] = WAYS.index("seen")
     return way
 
 
@@ -124,14 +124,9 @@ def _crowded(points_m: F32, low: F64, size: tuple[int, int]) -> Bools:
 
 
 def _distance_m(obstacle: Bools) -> F64:
-    """Distance of each cell to the nearest obstacle."""
     if not obstacle.any():
         return np.full(obstacle.shape, np.inf)
     return np.asarray(ndimage.distance_transform_edt(~obstacle, sampling=CELL_M), np.float64)
-
-
-def _within(reached: Bools, gap_m: float) -> Bools:
-    return _distance_m(reached) <= gap_m
 
 
 def _share(known: Bools, radius_m: float) -> F64:

@@ -58,11 +58,6 @@ class Ground:
     offset_m: float | None
     doubt: str | None = None
 
-    @property
-    def camera_height_m(self) -> float:
-        """The camera's height above the floor."""
-        return float(self.T_world_camera[2, 3])
-
 
 def depth_error_m(depth_m: F32 | F64) -> F64:
     """Standard deviation (m) of a stereo camera's depth (m); it grows with the depth's square."""

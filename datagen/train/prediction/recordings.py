@@ -257,7 +257,6 @@ def _pixels(bag: Bag, topic: str, message: Any, encodings: Mapping[str, tuple[st
 
 
 def _picture(bag: Bag, topic: str, data: bytes) -> Image.Image:
-    """A decoded PNG or JPEG of a message."""
     return decoded(data, f"{bag.path}: a message of {topic}", ("PNG", "JPEG"))
 
 
@@ -332,7 +331,6 @@ class TransformTree:
         rows.extend(row)
 
     def lacks(self, which: str) -> NoTransformError:
-        """The error for a transform that is not there."""
         pairs = sorted(f"{parent} -> {child}" for child, rows in self._edges.items() for parent in rows)
         fix = f"Record /tf and /tf_static; it has {', '.join(pairs[:30])[:1000] or 'no transforms'}"
         return NoTransformError(self._bag.path, "tf", f"has no transform {which}", fix)

@@ -50,7 +50,6 @@ class Sessions(OrderedDict[str, list[Sent]]):
     """Frames of the latest sessions, the latest first. The oldest and the longest unused sessions go."""
 
     def add(self, name: str, frame: Sent) -> None:
-        """Keep a new frame of a session."""
         self[name] = [frame, *self.pop(name, [])][:MOST_FRAMES]
         while len(self) > MOST_SESSIONS:
             self.popitem(last=False)
@@ -58,7 +57,6 @@ class Sessions(OrderedDict[str, list[Sent]]):
 
 @lru_cache(maxsize=MOST_FRAMES)
 def _read(body: bytes) -> tuple[SensorFrame, list[OccupancyMap]]:
-    """The frame of a body, and the map that it has."""
     with tempfile.TemporaryDirectory() as folder:
         (file := Path(folder) / _BODY).write_bytes(body)
         frame, arrays = read_place(file), read_arrays(file, ("intrinsics", "map", "map_pose"))

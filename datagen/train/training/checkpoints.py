@@ -127,11 +127,11 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     """Load a complete checkpoint on the CPU. InputError as `load_model`; memory is bounded by its size."""
     place, data = str(path), read_regular(Path(path), MAX_BYTES, _FIX)
     try:
-        tensors, text = _read(data)
+        tensors, document = _read(data)
     except _NOT_READ as e:
         problem = f"not a datagen checkpoint, or damaged ({e!s:.200})"
         raise InputError(place, "", problem, _FIX) from None
-    document = _document(place, text)
+    _refuse_other_document(place, document)
     try:
         head = replace(_HEAD.validate_python(document["head"]), digest=hashlib.sha256(data).hexdigest())
         loop = dict(document["loop"])
@@ -196,40 +196,35 @@ def _own(tensor: Tensor) -> Tensor:
     return tensor.detach().cpu().contiguous().clone()
 
 
-def _read(data: bytes) -> tuple[dict[str, Tensor], str]:
-    """The tensors of a safetensors file and its `head`. ValueError and others for one that is damaged."""
+def _read(data: bytes) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The tensors of a safetensors file and its `head`, read. ValueError and others for a damaged one."""
     end = 8 + int.from_bytes(data[:8], "little")
     if not 8 < end <= min(len(data), _MAX_HEADER_BYTES):
         raise ValueError("no header of a safetensors file")
     header: Any = json.loads(data[8:end])
-    text: str = header.pop("__metadata__")["head"]
+    document: dict[str, Any] = json.loads(header.pop("__metadata__")["head"])
     if len(header) > _MAX_TENSORS:
         raise ValueError("too many tensors")
     for name, entry in header.items():
         if entry["dtype"] not in _DTYPES or len(entry["shape"]) > _MAX_AXES:
             raise ValueError(f"tensor {name!r:.80} has a type or shape that no checkpoint has")
-    stated: str = json.loads(text)["sha256"]
+    stated: str = document["sha256"]
     unsigned = data[:end].replace(stated.encode(), _UNSIGNED, 1)
     digest = hashlib.sha256(unsigned)
     digest.update(memoryview(data)[end:])
     if digest.hexdigest() != stated:
         raise ValueError("its checksum is another one")
-    return safetensors.torch.load(data), text
+    return safetensors.torch.load(data), document
 
 
-def _document(place: str, text: object) -> dict[str, Any]:
-    try:
-        document: Any = json.loads(text) if isinstance(text, str) else None
-    except (ValueError, RecursionError):
-        document = None
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
+def _refuse_other_document(place: str, document: dict[str, Any]) -> None:
+    if document.get("format") != FORMAT:
         raise InputError(place, "head", "is not that of a datagen checkpoint", _FIX)
     _refuse_odd_values(place, document)
     version = document.get("format_version")
     if version != FORMAT_VERSION:
         problem = f"is {version!r:.20}, but this program reads {FORMAT_VERSION}"
         raise InputError(place, "format_version", problem, "Use the version of datagen that wrote it")
-    return document
 
 
 def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

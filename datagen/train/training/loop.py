@@ -154,7 +154,7 @@ def _step(training: Training, batch: Batch[Array], clock: _Clock) -> TrainingSte
     at.batch, at.step = at.batch + 1, at.step + 1
     at.sums = [a + b for a, b in zip(at.sums, sums, strict=True)]
     _add_cost(at, wall_s, cpu_s, wait_s)
-    return TrainingStep(at.step, steps, at.epoch + 1, sums[1] / sums[0], rate, len(batch), wait_s, wall_s)
+    return TrainingStep(at.step, steps, at.epoch + 1, sums[1] / sums[0], len(batch), wait_s, wall_s)
 
 
 def _end_epoch(training: Training, clock: _Clock) -> dict[str, Any]:
@@ -183,7 +183,6 @@ def _end_epoch(training: Training, clock: _Clock) -> dict[str, Any]:
 
 
 def _refuse(quantity: str, at: Position, batch: Batch[Array], bad: Tensor) -> NoReturn:
-    """Raise InputError that names the samples."""
     ids = [bytes(i).hex() for i in batch.sample_id[bad.cpu().numpy()]]
     named = ", ".join(ids[:_IDS_NAMED]) + (", ..." if len(ids) > _IDS_NAMED else "")
     raise InputError(
@@ -271,7 +270,6 @@ class TrainingStep:
     steps: int  # in the whole schedule
     epoch: int  # counted from 1
     loss: float
-    lr: float
     samples: int
     wait_s: float  # for the batch
     step_s: float  # for the whole step

@@ -13,7 +13,6 @@ from datagen.schemas.errors import InputError
 class TrainingStage:
     """One row of the paper's schedule (GBPP, Sec. III-D): which labels, and which loss."""
 
-    name: str
     label_sources: tuple[str, ...]
     weighted: bool  # cross-entropy weighted by class, so that both classes count alike
     lr: float
@@ -23,9 +22,9 @@ class TrainingStage:
 
 # The paper gives the losses and the order; rates, decay and epochs are ours.
 STAGES: dict[str, TrainingStage] = {
-    "stage1": TrainingStage("stage1", ("heuristic",), True, 2e-3, 0.0, 12),
-    "stage2": TrainingStage("stage2", ("plan", "sim"), False, 1e-3, 1e-2, 20),
-    "sim-only": TrainingStage("sim-only", ("plan", "sim"), False, 2e-3, 1e-2, 20),
+    "stage1": TrainingStage(("heuristic",), True, 2e-3, 0.0, 12),
+    "stage2": TrainingStage(("plan", "sim"), False, 1e-3, 1e-2, 20),
+    "sim-only": TrainingStage(("plan", "sim"), False, 2e-3, 1e-2, 20),
 }
 
 

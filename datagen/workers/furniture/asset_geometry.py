@@ -147,7 +147,8 @@ def asset_geometry(asset: Asset, is_open: bool = False) -> tuple[Mesh, tuple[F32
     """
     width, depth, height = (max(side, _THINNEST_M) for side in asset.size_m)
     asset = replace(asset, size_m=(width, depth, height))
-    shape, palette = SHAPES.get(asset.object_type, (_by_proportions(asset), _PLASTIC))
+    is_square = 0.8 < width / depth < 1.25
+    shape, palette = SHAPES.get(asset.object_type, (s.column if is_square else s.block, _PLASTIC))
     if min(asset.size_m) < _DETAIL_M and asset.object_type != "Painting":
         shape = s.block
     elif is_open:
@@ -156,9 +157,3 @@ def asset_geometry(asset: Asset, is_open: bool = False) -> tuple[Mesh, tuple[F32
     for array in (mesh.vertices_m, mesh.faces, mesh.face_rgb, *parts_m):
         array.setflags(write=False)
     return mesh, parts_m
-
-
-def _by_proportions(asset: Asset) -> Shape:
-    """A column if the footprint is about square, else a box."""
-    width, depth, _ = asset.size_m
-    return s.column if 0.8 < width / depth < 1.25 else s.block

@@ -42,7 +42,6 @@ class Mesh:
     file: MeshFile | None = None
 
     def transformed(self, T_parent_mesh: F64) -> Mesh:
-        """The mesh in the parent's frame; `T_parent_mesh` is (4, 4)."""
         vertices_m = self.vertices_m @ T_parent_mesh[:3, :3].T + T_parent_mesh[:3, 3]
         return Mesh(vertices_m.astype(np.float32), self.faces, self.face_rgb, self.texture, self.file)
 

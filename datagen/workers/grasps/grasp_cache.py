@@ -40,7 +40,6 @@ class GraspSet:
         return len(self.opening_m)
 
     def score_of(self, row: int) -> float:
-        """The score of one grasp."""
         if row < len(self.score):
             return float(self.score[row])
         assert self.later_score is not None
@@ -109,7 +108,6 @@ class _Known:
                 return
 
     def score(self, search: int, block: int) -> F32:
-        """Scores of a block of poses of a search."""
         if (search, block) not in self.scores:
             key = file_digest([self.digest, search, block])
             stored = _SCORES.load(key)

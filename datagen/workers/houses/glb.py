@@ -74,7 +74,6 @@ def read_pieces(path: Path, kind: str, resolver: Any = None) -> list[Any]:
 
 
 def _description(path: Path, data: bytes) -> bytes:
-    """The JSON document of a binary glTF file. InputError where it is none."""
     if len(data) < 20 or data[:4] != b"glTF" or data[16:20] != b"JSON":
         raise InputError(path, "", "is not a binary glTF file", _FIX)
     return data[20 : 20 + int.from_bytes(data[12:16], "little")]

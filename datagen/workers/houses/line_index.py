@@ -93,7 +93,6 @@ def open_lines(path: Path) -> LineIndex:
 
 
 def _opened(path: Path, packed: Path | IO[bytes]) -> LineIndex | None:
-    """The index from a zip; None if it is absent or damaged."""
     try:
         archive = zipfile.ZipFile(packed)
         lines: list[Line] = []

@@ -133,7 +133,10 @@ def _rooms(node: JsonNode) -> tuple[list[Room], list[StaticBody]]:
         )
         if abs(height_m) > MAX_FLOOR_M:
             raise outline.error(f"another floor: it lies at {height_m:g} m, not at 0", _ONE_FLOOR)
-        corners = np.array([_ground(p) for p in outline.items(MAX_CORNERS)], np.float64).reshape(-1, 2)
+        corners = np.array(
+            [[p.get(k).number(-EXTENT_M, EXTENT_M) for k in "xz"] for p in outline.items(MAX_CORNERS)],
+            np.float64,
+        ).reshape(-1, 2)
         polygon_m = clean_polygon(corners)
         if isinstance(polygon_m, str):
             raise outline.error(f"the floor has {polygon_m}")
@@ -227,7 +230,3 @@ def _holes(
 
 def _text_or_empty(node: JsonNode | None) -> str:
     return "" if node is None else node.text()
-
-
-def _ground(node: JsonNode) -> tuple[float, float]:
-    return (node.get("x").number(-EXTENT_M, EXTENT_M), node.get("z").number(-EXTENT_M, EXTENT_M))

@@ -74,7 +74,6 @@ class MapHouses:
     kind: str = "map"
 
     def house_ids(self) -> list[str]:
-        """Ids, sorted."""
         return list(self.paths)
 
     def load(self, house_id: str) -> House:

@@ -38,7 +38,6 @@ class ProcthorHouses:
     kind: str = "procthor"
 
     def house_ids(self) -> list[str]:
-        """Ids, sorted."""
         return list(self.places)
 
     def load(self, house_id: str) -> House:

@@ -95,7 +95,6 @@ class ArmInScene:
         return yaw_pose(x, y, self.robot.base_height_m, yaw_rad)
 
     def path_generator(self, index: int, spec: Specification) -> np.random.Generator:
-        """The generator of plans from candidate `index`, in this draw."""
         other = (self.draw,) if self.draw else ()
         return generator(spec.seed, Stream.PATH, self.scene.index, self.scene.retry, index, *other)
 
@@ -293,9 +292,3 @@ def draw_disturbances(
 def _planar(normal: F64, position_std_m: float, yaw_std_rad: float) -> F64:
     x_m, y_m = normal[:2] * position_std_m
     return yaw_pose(float(x_m), float(y_m), 0.0, float(normal[2] * yaw_std_rad))
-
-
-def target_tcp(at: ArmInScene, T_world_base: F64, plan: MotionPlan) -> F64:
-    """Pose (4, 4) of the TCP in the target's frame at the planned grasp."""
-    T_world_tcp = T_world_base @ at.robot.T_base_tcp(plan.q_approach_rad[-1])
-    return inverse(at.scene.T_world_object[0]) @ T_world_tcp

@@ -13,13 +13,13 @@ from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse
 from datagen.workers.labels import Columns, LabelSource, heuristic_source
 from datagen.workers.labels.arm_labelling import (
     ArmInScene,
     CandidateTrial,
     arm_in_scene,
     arm_of,
-    target_tcp,
     try_candidate,
 )
 from datagen.workers.motion import MotionPlan
@@ -135,7 +135,8 @@ def _write(columns: Columns, k: int, trial: CandidateTrial) -> None:
 
 
 def _write_plan(columns: Columns, k: int, at: ArmInScene, T_world_base: F64, plan: MotionPlan) -> None:
-    columns["T_target_tcp"][k] = target_tcp(at, T_world_base, plan)
+    T_world_tcp = T_world_base @ at.robot.T_base_tcp(plan.q_approach_rad[-1])
+    columns["T_target_tcp"][k] = inverse(at.scene.T_world_object[0]) @ T_world_tcp
     columns["grasp_score"][k] = plan.grasp_score
     columns["q_grasp_rad"][k] = plan.q_approach_rad[-1]
     columns["path_length_rad"][k] = plan.length_rad
@@ -147,17 +148,13 @@ def label_executed(
 ) -> Columns:
     """The columns of `plan`, with outcomes and measurements of trials."""
     columns, trials = label_with_trials(scene, candidates, spec, clock)
-
-    def column(dtype: str, values: list[float]) -> np.ndarray:
-        return np.array(values, dtype)
-
     columns |= {
-        "attempts": column("int16", [len(t.results) for t in trials]),
-        "retry_outcome": column("uint8", [_RETRY_CODES[t.retry_outcome or "none"] for t in trials]),
-        "lift_m": column("float32", [t.results[-1].lift_m if t.results else 0.0 for t in trials]),
-        "slip_m": column("float32", [t.results[-1].slip_m if t.results else 0.0 for t in trials]),
-        "disturbed_m": column("float32", [t.results[-1].disturbed_m if t.results else 0.0 for t in trials]),
-        "simulated_s": column("float32", [sum(r.simulated_s for r in t.results) for t in trials]),
+        "attempts": np.array([len(t.results) for t in trials], "int16"),
+        "retry_outcome": np.array([_RETRY_CODES[t.retry_outcome or "none"] for t in trials], "uint8"),
+        "lift_m": np.array([t.results[-1].lift_m if t.results else 0.0 for t in trials], "float32"),
+        "slip_m": np.array([t.results[-1].slip_m if t.results else 0.0 for t in trials], "float32"),
+        "disturbed_m": np.array([t.results[-1].disturbed_m if t.results else 0.0 for t in trials], "float32"),
+        "simulated_s": np.array([sum(r.simulated_s for r in t.results) for t in trials], "float32"),
     }
     return columns
 

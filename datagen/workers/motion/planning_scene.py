@@ -86,11 +86,6 @@ class PlanningScene:
     compiled_limits: Limits
     around: HandScene
 
-    @property
-    def grasps_free(self) -> int:
-        """Number of grasps of the target that the hand without an arm can reach."""
-        return self.around.grasps_free
-
 
 def prepare(
     scene: SettledScene,

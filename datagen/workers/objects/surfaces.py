@@ -57,7 +57,6 @@ class Surface:
         return moved if np.prod(np.broadcast_to(scale, 3)) > 0 else moved.turned()
 
     def turned(self) -> Surface:
-        """The surface with its faces turned over."""
         return replace(self, faces=self.faces[:, ::-1], uv=self.uv[:, ::-1])
 
     def painted(self, rgb: Sequence[float] | None, image: U8 | None = None) -> Surface:

@@ -45,7 +45,6 @@ class BuiltinHouses:
     kind: str = "builtin"
 
     def house_ids(self) -> list[str]:
-        """Ids by number."""
         return [_house_id(k) for k in range(self.count)]
 
     def load(self, house_id: str) -> House:

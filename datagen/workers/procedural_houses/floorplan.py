@@ -42,7 +42,6 @@ class Stretch:
         return abs(self.end_m[0] - self.start_m[0]) + abs(self.end_m[1] - self.start_m[1])
 
     def at(self, along_m: float) -> tuple[float, float]:
-        """The point at `along_m` from the start."""
         share = along_m / self.length_m
         (x0, y0), (x1, y1) = self.start_m, self.end_m
         return (x0 + share * (x1 - x0), y0 + share * (y1 - y0))

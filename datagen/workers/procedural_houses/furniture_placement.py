@@ -56,7 +56,6 @@ class Furnisher:
     def place(
         self, spots: list[Spot], front_m: float = 0.0, is_tall: bool = False, is_partner: bool = False
     ) -> Placed | None:
-        """Place an asset at the first spot that fits; None if none does."""
         for spot in spots:
             if self.layout.fits(spot, is_partner, is_tall):
                 self.layout.take(spot, front_m)
@@ -97,7 +96,6 @@ class Furnisher:
                 self.put_on(below, asset, right, front)
 
     def add_pillows(self, sofa: Placed) -> None:
-        """Put a pillow in each corner of a sofa, at random."""
         asset = sofa[0].asset
         for side in (-1.0, 1.0):
             if self.rng.random() < 0.6:

@@ -10,7 +10,6 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from datagen.workers.furniture.assets import Asset, top_rectangles
-from datagen.workers.geometry.mesh import F64
 from datagen.workers.procedural_houses.floorplan import FloorPlan, Opening, PlannedRoom, Rect
 
 # Type: width, depth, height in metres, and the share by which variants differ from it.
@@ -234,7 +233,9 @@ class RoomLayout:
             in_y = (ys > b0 - _BODY_RADIUS_M) & (ys < b1 + _BODY_RADIUS_M)
             free &= ~(in_x[:, None] & in_y[None])
         regions = cast(npt.NDArray[np.int32], cast(Any, ndimage.label(free))[0])
-        at_doors = {_region_at(regions, xs, ys, p) for p in self.door_points}
+        at_doors = {
+            int(regions[np.argmin(np.abs(xs - x)), np.argmin(np.abs(ys - y))]) for x, y in self.door_points
+        }
         return 0 not in at_doors and len(at_doors) <= 1
 
 
@@ -265,10 +266,6 @@ def _door_point(opening: Opening, inner: Rect) -> tuple[float, float]:
     x, y = opening.stretch.at(sum(opening.along_m) / 2)
     m = _BODY_RADIUS_M + _CELL_M
     return (float(np.clip(x, inner[0] + m, inner[2] - m)), float(np.clip(y, inner[1] + m, inner[3] - m)))
-
-
-def _region_at(regions: npt.NDArray[np.int32], xs: F64, ys: F64, point: tuple[float, float]) -> int:
-    return int(regions[np.argmin(np.abs(xs - point[0])), np.argmin(np.abs(ys - point[1]))])
 
 
 def _front_zone(rect: Rect, yaw_deg: float, depth_m: float) -> Rect:

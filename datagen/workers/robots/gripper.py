@@ -47,11 +47,6 @@ class Gripper:
     finger_parts_m: tuple[Parts, Parts]  # TCP frame, fingers closed (opening 0)
     linkage: Linkage | None = None
 
-    @property
-    def side(self) -> Ints:
-        """(B,) 1 and -1 for bodies on the sides of +y and -y, 0 for the palm."""
-        return np.array([0, 1, -1]) if self.linkage is None else self.linkage.side
-
     def body_poses(self, opening_m: F64) -> F64:
         """Poses (M, B, 4, 4) of the bodies in the TCP frame with the pads `opening_m` (M,) apart."""
         if self.linkage is None:

@@ -232,7 +232,6 @@ def _is_telescope(tree: KinematicTree, upper: int, lower: int) -> bool:
 
 
 def _part_pairs(parts: contacts.Parts, links: Sequence[tuple[int, int]]) -> Ints:
-    """Pairs (K, 2) of parts of the pairs of links."""
     of = [np.flatnonzero(parts.owner == link) for link in range(int(parts.owner.max(initial=-1)) + 1)]
     rows = [(i, j) for a, b in links if b < len(of) for i in of[a].tolist() for j in of[b].tolist()]
     return np.array(rows, np.int64).reshape(-1, 2)

@@ -93,7 +93,6 @@ class UrdfTree:
         return self.links[name]
 
     def children(self, link: str) -> list[Joint]:
-        """Joints whose parent is the link."""
         return [joint for joint in self.joints.values() if joint.parent == link]
 
     def joint_above(self, link: str) -> Joint | None:

@@ -29,7 +29,7 @@ from datagen.workers.houses.house import Room, Surface
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.rendering import Camera, Frame, SceneGeometry, load_renderer
 from datagen.workers.rendering.cloud import Cloud, PixelCaster, caster_of, observe_cloud
-from datagen.workers.rendering.embree import RayScene, cast_pixels
+from datagen.workers.rendering.embree import RayScene, cast_pixels, ray_scene
 from datagen.workers.rendering.noise import add_noise
 from datagen.workers.rendering.visibility import visible_pixels
 from datagen.workers.scenes import Scene
@@ -122,8 +122,7 @@ def _try_scene(
         kept, start = drop_poses(
             [world.object(name) for name in names], surface, standing, spec.scene, rng, room_m
         )
-        names = [names[k] for k in kept]
-        models = tuple(world.object(name) for name in names)
+        models = tuple(world.object(names[k]) for k in kept)
         static = nearby_parts(house.house, surface, _SURROUNDINGS_M)
 
     with clock.stage("settle"):
@@ -138,8 +137,8 @@ def _try_scene(
             raise SceneRejected("no_base")
 
     with clock.stage("observe"):
-        rays = world.ray_scene(house, names, settled.T_world_object)
         geometry = SceneGeometry(house.house, models, settled.T_world_object)
+        rays = ray_scene(geometry)
         seen = observe(house, surface.room_id, geometry, rays, spec, (index, retry))
     scene = Scene(index, retry, redraws, house, surface, models, settled, rays, *seen)
     return scene, candidates
@@ -233,7 +232,6 @@ def check_settled(
 
 
 def _lowest_m(model: ObjectModel, T_world_object: F64) -> float:
-    """Height of the object's lowest point, world."""
     z = T_world_object[2, :3]
     return float(min((part @ z).min() for part in model.convex_parts_m) + T_world_object[2, 3])
 

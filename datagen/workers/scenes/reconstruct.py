@@ -17,7 +17,7 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import is_pose
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.rendering import Camera, SceneGeometry
-from datagen.workers.rendering.embree import RayScene
+from datagen.workers.rendering.embree import RayScene, ray_scene
 from datagen.workers.world import PreparedHouse, World
 
 Record = Mapping[str, Any]  # one row of the scene table, or the samples' columns, by field name
@@ -87,7 +87,7 @@ def reconstruct_scene(world: World, record: Record) -> ReconstructedScene:
     for model, digest in zip(models, record["object_digest"], strict=False):
         _check_digest(model.name, model.digest, str(digest))
     camera = Camera(T_world_camera, width, height, fx, fy, cx, cy)
-    rays = world.ray_scene(house, names, T_world_object)
+    rays = ray_scene(SceneGeometry(house.house, models, T_world_object))
     return ReconstructedScene(index, retry, house, models, T_world_object, rays, camera)
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
 
 import numpy as np
 
@@ -11,7 +13,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.specification import SettleParams
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.registry import can_import, entry
+from datagen.workers.registry import entry
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +73,8 @@ def load_settler(name: str) -> Settler:
 
 def first_settler() -> str:
     """The first settler of the registry that can be imported here."""
-    for name in SETTLERS:
-        if can_import(SETTLERS, name):
+    for name, target in SETTLERS.items():
+        with suppress(ImportError):
+            import_module(target.partition(":")[0])
             return name
     raise InputError("settle.engine", "", "none can be imported here", "Run `datagen doctor`")

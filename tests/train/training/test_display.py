@@ -19,7 +19,7 @@ RECORD: dict[str, Any] = {
 
 
 def step(k: int, step_s: float = 2.0) -> TrainingStep:
-    return TrainingStep(k, 100, 1, 0.5, 1e-3, samples=60, wait_s=0.1 * step_s, step_s=step_s)
+    return TrainingStep(k, 100, 1, 0.5, samples=60, wait_s=0.1 * step_s, step_s=step_s)
 
 
 def test_lines_are_json_also_on_a_terminal_with_the_speed_of_the_last_minute():

@@ -199,12 +199,12 @@ def test_all_grasps_are_checked_where_the_first_are_blocked() -> None:
     """Those from above come first here, and a shelf takes them."""
     assert (np.diff(box_grasps().T_object_tcp[:, 2, 2]) >= 0).all()
     some = prepared(below_a_shelf(), per_scene=len(FROM_ABOVE))
-    assert some.grasps_free == len(FROM_SIDES)
+    assert some.around.grasps_free == len(FROM_SIDES)
     assert plan_at(some, below_a_shelf()).outcome == "success"
     every, rows = box_grasps(), FROM_ABOVE
     from_above = GraspSet(every.T_object_tcp[rows], every.opening_m[rows], every.score[rows])
     none = prepared(below_a_shelf(), grasps=from_above)
-    assert none.grasps_free == 0 and plan_at(none, below_a_shelf()).outcome == "no_grasp"
+    assert none.around.grasps_free == 0 and plan_at(none, below_a_shelf()).outcome == "no_grasp"
 
 
 def test_a_candidate_tries_other_grasps_where_the_first_fail() -> None:

@@ -99,7 +99,7 @@ def test_a_low_shelf_leaves_no_grasp_from_above() -> None:
     shelf = over_target("shelf", (0.5, 0.3, 0.02), BOX_M[2] + 0.15)
     scene = table_scene([shelf])
     ready = prepared(scene)
-    assert 0 < ready.grasps_free < len(box_grasps())
+    assert 0 < ready.around.grasps_free < len(box_grasps())
     free = ready.around.arrays.is_free > 0
     assert (ready.around.arrays.T_world_tcp[free, 2, 2] > -0.5).all()
     judged(scene, arm(), front_base(scene), plan_candidate(ready, front_base(scene), rng()))
@@ -185,7 +185,7 @@ def test_skipped_grasps_are_not_used_again() -> None:
 def test_taking_clutter_away_turns_no_success_into_a_collision() -> None:
     full, empty = table_scene(clutter=CLUTTER), table_scene()
     a, b = prepared(full), prepared(empty)
-    assert a.grasps_free <= b.grasps_free
+    assert a.around.grasps_free <= b.around.grasps_free
     for dx in (-0.4, -0.2, 0.0, 0.2, 0.4):
         for away in (0.45, 0.6):
             base = front_base(full, dx_m=dx, away_m=away)

@@ -285,6 +285,7 @@ def test_the_hand_closes_on_a_box_of_each_width(robot: Robot) -> None:
     poses = gripper.body_poses(openings)
     known = gripper.linkage
     bodies = (gripper.palm_parts_m, *gripper.finger_parts_m) if known is None else known.parts_m
+    side = [0, 1, -1] if known is None else known.side
     shapes = [[polyhedron(part) for part in parts] for parts in bodies]
     for width, depth, T in zip(openings, depths, poses, strict=True):
         for margin in (-0.002, 0.002):
@@ -292,7 +293,7 @@ def test_the_hand_closes_on_a_box_of_each_width(robot: Robot) -> None:
             corners = ((np.arange(8)[:, None] >> np.arange(3)) & 1) - 0.5
             box = polyhedron(corners * size)
             touched = {
-                int(gripper.side[b])
+                int(side[b])
                 for b, body in enumerate(shapes)
                 for shape in body
                 if collides(shape, T[b], box, (0.0, 0.0, depth))
