@@ -5,8 +5,7 @@ r"""CPU seconds of a prediction: imports, loading, and each frame with a model t
 
 FRAME is a folder of benchmarks.write_frames.
 Without a checkpoint the released model is used. The first frame is listed separately; the others by their
-median, once with all base poses scored, as by `datagen predict`, and once with the clear ones alone, as by
-`datagen serve`. Each frame has another reach, since scores of the same question are kept.
+median. Each frame has another reach, since scores of the same question are kept.
 """
 
 from __future__ import annotations
@@ -31,31 +30,25 @@ def main() -> None:
     import numpy as np
 
     from datagen.train.prediction import RobotSize, load_scorer, predict, read_footprint, read_place
-    from datagen.train.program_scorer import ProgramScorer
 
     imported_s = time.process_time()
     scorer = load_scorer(options.checkpoint)
     loaded_s = time.process_time()
     print(f"imports {imported_s - started_s:.2f} s, model {loaded_s - imported_s:.2f} s of CPU")
     footprint = read_footprint(options.footprint)
-    for only_clear in (False, True) if isinstance(scorer, ProgramScorer) else (False,):
-        if isinstance(scorer, ProgramScorer):
-            scorer.only_clear = only_clear
-        parts: list[tuple[float, float]] = []
-        for k in range(options.repeats + 1):
-            robot = RobotSize(1.2, 0.7, 0.9 + 1e-4 * k, footprint)
-            begun_s = time.process_time()
-            frame = read_place(options.frame)
-            if options.click and frame.image is not None:
-                frame = replace(frame, image=replace(frame.image, mask=None), on_target=None)
-            read_s = time.process_time()
-            predict(scorer, [frame], robot, camera_height_m=options.camera_height, click=options.click)
-            parts.append((read_s - begun_s, time.process_time() - read_s))
-        read, predicted = np.median(parts[1:], axis=0)
-        if not only_clear:
-            print(f"first frame {sum(parts[0]):.2f} s")
-        poses = "clear base poses" if only_clear else "all base poses"
-        print(f"later frames, {poses}: {read + predicted:.3f} s, {read:.3f} s of them to read")
+    parts: list[tuple[float, float]] = []
+    for k in range(options.repeats + 1):
+        robot = RobotSize(1.2, 0.7, 0.9 + 1e-4 * k, footprint)
+        begun_s = time.process_time()
+        frame = read_place(options.frame)
+        if options.click and frame.image is not None:
+            frame = replace(frame, image=replace(frame.image, mask=None), on_target=None)
+        read_s = time.process_time()
+        predict(scorer, [frame], robot, camera_height_m=options.camera_height, click=options.click)
+        parts.append((read_s - begun_s, time.process_time() - read_s))
+    read, predicted = np.median(parts[1:], axis=0)
+    print(f"first frame {sum(parts[0]):.2f} s")
+    print(f"later frames {read + predicted:.3f} s, {read:.3f} s of them to read")
 
 
 if __name__ == "__main__":

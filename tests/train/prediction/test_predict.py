@@ -15,6 +15,7 @@ from scipy import ndimage
 
 import datagen
 from datagen import released
+from datagen.schemas.errors import InputError
 from datagen.schemas.specification import CandidateParams
 from datagen.train.arrivals import normal_arrival
 from datagen.train.baselines.rules import Analytic
@@ -22,7 +23,7 @@ from datagen.train.inputs import Array, Batch
 from datagen.train.prediction import RobotSize, predict
 from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import STATES, BaseCells, choose
-from datagen.train.prediction.frames import SensorFrame
+from datagen.train.prediction.frames import SensorFrame, image_frame
 from datagen.train.prediction.ground import level_pose
 from datagen.train.prediction.occupancy import KnownFloor
 from datagen.train.scorers import ModelScorer, Scorer
@@ -235,7 +236,7 @@ def test_of_about_equal_scores_the_pose_with_room_is_taken(side: int, data: st.D
     stands = patch.ravel() | (np.arange(side**2) == lone)
     state = np.where(stands, STATES.index("clear"), STATES.index("blocked"))
     score = np.where(np.arange(side**2) == lone, 0.93, np.where(stands, 0.92, 0.0))
-    cells = BaseCells(offsets, state, np.zeros(side**2, np.int64))
+    cells = BaseCells(offsets, state)
     best = choose(score, cells, ("clear",), 0.5, normal_arrival(0.02)).best
     assert best == (y + 1) * side + x + 1
     assert choose(score, cells, ("clear",), 0.5, None).best == lone
@@ -333,6 +334,27 @@ def test_missing_depth_on_the_target_is_filled_and_reported(seen: Seen, scorer: 
     assert answer.filled is not None and answer.filled.missing_pixels == holes.sum()
     assert any("without depth" in note for note in answer.notes)
     assert np.linalg.norm(answer.center_m - of(scorer, whole).center_m) < 0.01
+
+
+@pytest.mark.parametrize(("known", "is_enough"), [(14, True), (8, False)])
+def test_a_target_of_few_pixels_is_answered_with_doubts(
+    known: int, is_enough: bool, seen: Seen, scorer: ModelScorer
+) -> None:
+    whole = sensor_frame(seen)
+    assert whole.image is not None and whole.image.mask is not None
+    pixels = np.random.default_rng(0).permutation(np.flatnonzero(whole.image.mask.ravel()))[:25]
+    mask, depth_m = np.zeros(whole.image.mask.size, np.bool_), whole.image.depth_m.copy()
+    mask[pixels] = True
+    depth_m.ravel()[pixels[known:]] = 0.0
+    image = replace(whole.image, mask=mask.reshape(depth_m.shape), depth_m=depth_m)
+    frame = image_frame(image, whole.T_world_camera, {})
+    if not is_enough:
+        with pytest.raises(InputError, match=f"only {known} of the target's 25 pixels have depth"):
+            of(scorer, frame)
+        return
+    answer = of(scorer, frame)
+    assert np.linalg.norm(answer.center_m - of(scorer, whole).center_m) < 0.02
+    assert answer.level != "good" and answer.target_points == 25
 
 
 def test_the_lines_of_the_page_run(seen: Seen, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
