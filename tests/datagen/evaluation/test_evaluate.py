@@ -200,7 +200,9 @@ def test_bad_input_is_refused_in_one_line(
     (tmp_path / "thesis.tex").write_text("text")
     odd = tmp_path / "odd.toml"
     odd.write_text('[heuristic]\nmu = "far"\n')
-    heuristic = make_run(tmp_path / "heuristic").storage.url
+    heuristic, view = make_run(tmp_path / "heuristic").storage.url, str(tmp_path / "view")
+    seen_again = ["--scenes-from", run, "--view", "1", "--n", str(SCENES * CELLS), "--out", view]
+    assert cli.run(["submit", "plan", *seen_again, "--workers", "0"]) == 0
     cases: list[tuple[list[str], list[str]]] = [
         ([file], ["PATH", "no run is given"]),
         ([file, str(tmp_path / "none")], ["none", "neither a checkpoint file nor a run folder"]),
@@ -209,6 +211,7 @@ def test_bad_input_is_refused_in_one_line(
         ([run, "--baselines", "none"], ["PATH", "no model or baseline given"]),
         ([file, file, run], ["METHOD: c: is the name of two methods"]),
         ([file, run, run], ["sample_id", "occurs twice"]),
+        ([file, run, view], ["view: scenes: are also in another run", "another viewpoint"]),
         ([file, run, "--baselines", "luck"], ["--baselines: luck: is not a baseline"]),
         ([file, run, "--baselines", "scalars"], ["--baselines: scalars", "--fit"]),
         ([file, run, "--fit", heuristic, "--baselines", "distance"], ["label_source: is heuristic"]),
