@@ -200,6 +200,8 @@ def test_bad_input_is_refused_in_one_line(
     (tmp_path / "thesis.tex").write_text("text")
     odd = tmp_path / "odd.toml"
     odd.write_text('[heuristic]\nmu = "far"\n')
+    (rule := tmp_path / "rule.toml").write_text("[heuristic]\nmu = 0.5\n")
+    near = grids.parent / "test"
     heuristic, view = make_run(tmp_path / "heuristic").storage.url, str(tmp_path / "view")
     seen_again = ["--scenes-from", run, "--view", "1", "--n", str(SCENES * CELLS), "--out", view]
     assert cli.run(["submit", "plan", *seen_again, "--workers", "0"]) == 0
@@ -217,6 +219,8 @@ def test_bad_input_is_refused_in_one_line(
         ([file, run, "--fit", heuristic, "--baselines", "distance"], ["label_source: is heuristic"]),
         ([file, run, "--heuristic", str(tmp_path / "thesis.tex"), *QUICK], ["thesis.tex", "is not TOML"]),
         ([file, run, "--heuristic", str(odd), *QUICK], ["odd.toml: heuristic.mu", "given: far"]),
+        ([file, run, "--heuristic", str(rule), *QUICK], ["rule.toml: is for the baseline analytic"]),
+        ([file, str(near), "--arrival", "nav2"], ["--arrival: is for picks on whole grids"]),
         ([file, run, "--out", "page.html"], ["--out", "not a .json file"]),
         ([file, run, "--out", str(tmp_path / "no" / "page.json")], ["--out", "folder does not exist"]),
         ([file, run, "--arrival", "ring:1"], ["--arrival: ring:1"]),
