@@ -187,4 +187,4 @@ def _mean(value: F64, some: Any, weights: Weights) -> Estimate:
     parts = np.zeros((len(value), 2))
     parts[some] = np.column_stack([value[some], np.ones(len(some))])
     whole, drawn = parts.sum(axis=0), summed(weights, parts)
-    return Estimate(float(ratio(whole[0], whole[1])), ratio(drawn[..., 0], drawn[..., 1]))
+    return Estimate(float(ratio(whole[0], whole[1])), ratio(drawn[..., 0], drawn[..., 1]), len(some))
