@@ -14,6 +14,7 @@ import pytest
 
 from datagen import cli
 from datagen.evaluation.report import parts_by_place
+from datagen.evaluation.report_tables import grid_tables
 from tests.datagen.evaluation.conftest import checkpoint
 from tests.datagen.evaluation.made_columns import make_columns
 from tests.refusals import refused
@@ -58,6 +59,14 @@ def test_checkpoints_files_and_baselines_are_scored(
     )
     assert json.loads(out.read_text()) == report
     assert [m["name"] for m in report["methods"]] == ["tiny", "file", "proximity"]
+    # Reading a file is not the time of its method.
+    assert [m["seconds_per_600"] is None for m in report["methods"]] == [False, True, False]
+    table = next(grid_tables(report, next(part["grids"] for part in report["parts"] if part["grids"])))
+    assert {row[0]: row[-1] == "-" for row in table.rows[:3]} == {
+        "tiny": False,
+        "file": True,
+        "proximity": False,
+    }
     assert str(tmp_path) not in out.read_text() and str(small_benchmark) not in out.read_text()
     stored = arrays_of(small_benchmark / "test")
     label, score = stored["label"] == 1, near(stored)
