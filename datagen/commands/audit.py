@@ -31,7 +31,13 @@ def audit(
     """
     if not runs:
         raise InputError("datagen audit", "RUN", "is missing", "Name one or more run folders")
-    report = audit_runs([run for path in runs for run in open_runs(path)])
+    opened = [(number, run) for number, path in enumerate(runs) for run in open_runs(path)]
+    first = dict[str, int]()
+    for number, run in opened:
+        if (other := first.setdefault(run.manifest.spec_hash, number)) != number:
+            problem = f"has the specification of {runs[other]}, so labels and costs would count twice"
+            raise InputError(runs[number], "", problem, "Name it once, or merge them with `datagen merge`")
+    report = audit_runs([run for _, run in opened])
     if json:
         print_json(report)
     else:

@@ -130,10 +130,10 @@ def _specifications(paths: Sequence[str], candidates: Sets) -> list[Specificatio
         if spec.heuristic != first.heuristic:
             problem = f"differs from that of {first_path}"
             raise InputError(path, "heuristic", problem, "Calibrate the two runs separately")
-        if spec.scenes_hash in scenes:
+        if spec.candidates_hash in scenes:
             problem = "are also in another run of this command"
             raise InputError(path, "scenes", problem, "Name each set of scenes once")
-        scenes.add(spec.scenes_hash)
+        scenes.add(spec.candidates_hash)
         held = spec.candidates.within or "grid"
         if CANDIDATE_SETS.index(candidates) > CANDIDATE_SETS.index(held):
             problem = f"the run has {held} candidates, not {candidates}"

@@ -93,12 +93,18 @@ def evaluate(
     kept = "" if closed_loop is None else _kept_outcomes(closed_loop, execute, workers, file)
     checkpoints, run_paths = split_paths([str(path) for path in paths])
     runs = open_evaluated_runs(run_paths)
+    if arrivals and not any(run.cells for run in runs):
+        fix = "Name a run of --candidates-per-scene grid, or omit it"
+        raise InputError("--arrival", "", "is for picks on whole grids, which no run has", fix)
     models = open_models(checkpoints, runs)
     if not allow_seen_houses:
         refuse_seen_houses(runs, models)
     rule = None if heuristic is None else read_heuristic(Path(heuristic), runs, allow_seen_houses)
     fitted_on = [str(path) for path in fit or ()]
     plain = baseline_methods(baselines, fitted_on, runs, rule, allow_seen_houses, json)
+    if rule is not None and all(method.name != "analytic" for method in plain.baselines):
+        fix = "Give --baselines analytic too, or omit it"
+        raise InputError("--heuristic", str(heuristic), "is for the baseline analytic alone", fix)
     methods = [*plain.baselines, *models]
     if not methods:
         fix = "Name a checkpoint, or omit --baselines"

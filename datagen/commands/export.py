@@ -66,7 +66,7 @@ def export(given: ExportOptions) -> dict[str, Any]:
         >>> exported["files"], exported["scenes"]
         (1, 2)
     """
-    source = open_source(str(given.run), given.scenes, given)
+    source = open_source(str(given.run), None if given.scenes is None else str(given.scenes), given)
     if given.to == "frames" and not given.json:
         image = source.runs[0].manifest.spec.observation
         pixels = (source.past - source.first) * image.width_px * image.height_px

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,6 +17,7 @@ from datagen.console.options import AS_FOUND, AssetSources, RunPath, Whole, refu
 from datagen.console.printing import print_rows
 from datagen.exports.export_run import open_source
 from datagen.schemas.errors import InputError, choices
+from datagen.schemas.run import find_scene
 from datagen.workers.extras import refuse_missing
 
 _MOST = 10  # scenes in a file
@@ -47,7 +49,10 @@ def view(
 
     if out is not None:
         refuse_output(out, "--out", ".rrd")
-    source = open_source(run, None if scene is None else str(scene), given)
+    source = open_source(run, None, given)
+    if scene is not None:
+        find_scene(source.runs, scene)  # InputError where there are fewer
+        source = replace(source, first=scene, past=scene + 1)
     wanted, codes = dict[str, int](), {field.name: field.codes for _, field in source.runs[0].schema.fields}
     for name, value in (("place", place), ("outcome", outcome)):
         if value is not None and value not in (valid := codes.get(name, ())):

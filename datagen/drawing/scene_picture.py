@@ -21,12 +21,11 @@ from datagen.drawing.floor_plan import (
     draw_scores,
 )
 from datagen.schemas.fields import OUTCOMES, REDRAW_CAUSES, SceneRows
-from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import footprint_of
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.rendering import Frame
-from datagen.workers.scenes.generate import render_frame
+from datagen.workers.scenes.generate import noise_of, render_frame
 from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 Columns = Mapping[str, Any]
@@ -66,7 +65,7 @@ class Shown:
     @cached_property
     def frame(self) -> Frame:
         """The RGB-D frame, rendered again."""
-        rng = generator(self.spec.seed, Stream.NOISE, self.recalled.index, self.recalled.retry)
+        rng = noise_of(self.recalled, str(self.rows.record["room_id"]), self.spec)
         return render_frame(self.spec.observation, self.recalled.geometry, self.recalled.camera, rng)
 
     def position_text(self, row: int) -> str:

@@ -151,7 +151,8 @@ def arrival_table(
                 "any": float(np.nanmean(offered[some], axis=(1, 2)).mean()),
                 "methods": {
                     name: {
-                        pick: mean_of_scenes(value, some, weights).values() for pick, value in by_pick.items()
+                        pick: mean_of_scenes(value, some, weights, int(some.sum())).values()
+                        for pick, value in by_pick.items()
                     }
                     for name, by_pick in per_scene.items()
                 },

@@ -8,6 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -30,7 +31,7 @@ from datagen.train.baselines.baseline import Calibration, calibrate
 from datagen.train.baselines.scalars import Scalars
 from datagen.train.headings import refuse_other_heading, side_deg_of, trained_side_deg
 from datagen.train.program_scorer import ProgramScorer
-from datagen.train.run_parts import read_robots, specs_of
+from datagen.train.run_parts import read_robots, refuse_twins, specs_of
 from datagen.train.scorers import ModelScorer, Scorer, weights_sha256
 from datagen.train.splits import refuse_shared_houses
 from datagen.workers.extras import EXTRAS, how_to_get
@@ -192,12 +193,13 @@ def baseline_methods(
     if fit:
         for path in fit:
             refuse_no_trials(path)
-        stream = stream_of(fit)
+        fitted = [EvaluatedRun(path, specs_of(path), stream_of([path])) for path in fit]
+        refuse_twins([summary.part for each in fitted for summary in each.stream.parts])
         if not allow_seen_houses:
-            for run in runs:
-                refuse_shared_houses(stream, run.stream)
-        houses = frozenset(stream.house_ids())
-        batches = list(stream.epoch(0))
+            for each, run in product(fitted, runs):
+                refuse_shared_houses(each.stream, run.stream)
+        houses = houses.union(*(each.stream.house_ids() for each in fitted))
+        batches = [batch for each in fitted for batch in each.batches()]
         with steps("baselines fitted", len(made), json) as step:
             for k, baseline in enumerate(made):
                 (made[k],) = fit_baselines([baseline], batches)

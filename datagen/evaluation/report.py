@@ -14,6 +14,7 @@ from datagen.evaluation.comparisons import Method
 from datagen.evaluation.grids import arrival_table, decisive_grids
 from datagen.evaluation.methods import SEED, EvaluatedMethod
 from datagen.evaluation.runs import EvaluatedRun
+from datagen.evaluation.score_files import ScoreFile
 from datagen.evaluation.scores import evaluate_grids, evaluate_set, weights_for
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import PLACE_KINDS
@@ -94,7 +95,12 @@ def evaluation_report(
         "paper": PAPER,
         "runs": [run.record() for run in runs],
         "fitted_on": list(fit),
-        "methods": [each.record() | {"seconds_per_600": seconds_per_600[each.name]} for each in methods],
+        "methods": [
+            # Another program made the scores of a file, in a time that is not known.
+            each.record()
+            | {"seconds_per_600": None if isinstance(each.scorer, ScoreFile) else seconds_per_600[each.name]}
+            for each in methods
+        ],
         "left_out": dict(left_out),
         "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "level": LEVEL, "by": "scene"},
         "parts": made,

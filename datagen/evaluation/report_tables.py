@@ -121,7 +121,7 @@ def _choice(report: Report, scores: Report) -> Table:
 
 def grid_tables(report: Report, grids: Report) -> Iterator[Table]:
     """Table III, picks and the order of a grid's cells, with their comparisons and success on arrival."""
-    methods = [(r["name"], grids["methods"][r["name"]], f"{r['seconds_per_600']:.2g}")
+    methods = [(r["name"], grids["methods"][r["name"]], f"{s:.2g}" if (s := r["seconds_per_600"]) else "-")
                for r in models_first(report["methods"])]  # fmt: skip
     rows = [
         (

@@ -99,16 +99,16 @@ def open_evaluated_runs(paths: Sequence[str]) -> list[EvaluatedRun]:
     InputError for heuristic labels, for labels of different sources or versions, and for equal scenes.
     """
     opened: list[EvaluatedRun] = []
-    by_scenes: dict[str, str] = {}
+    by_candidates: dict[str, str] = {}
     kinds: dict[str, str] = {}
     for path in paths:
         refuse_no_trials(path)
         specs = specs_of(path)
         for spec in specs:
             kinds.setdefault(spec.label_source, path)
-            other = by_scenes.setdefault(spec.scenes_hash, spec.hash())
+            other = by_candidates.setdefault(spec.candidates_hash, spec.hash())
             if other != spec.hash():
-                problem = "are also in another run of this command, with other labels"
+                problem = "are also in another run of this command, with other labels or another viewpoint"
                 raise InputError(path, "scenes", problem, "Evaluate the two runs separately")
         if len(kinds) > 1:
             (first, at), (second, _) = kinds.items()

@@ -1,7 +1,7 @@
 """Scores from a CSV file: an id and a score a line, made by any program.
 
 The first line is `sample_id,score`. A line `# threshold: NUMBER` before it gives the lowest score that counts
-as good. Without that line scores are probabilities, and the threshold is 0.5.
+as good. Without that line scores are probabilities, and the threshold is 0.5. Empty lines do not count.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from datagen.train.inputs import F64, Array, Batch, is_clear
 
 HEAD = ("sample_id", "score")
 _MOST_BYTES = 2**30
-_ID = re.compile(r"[0-9a-f]{32}")
+_ID = re.compile(r"[0-9a-fA-F]{32}")
 _THRESHOLD = re.compile(r"#\s*threshold\s*:\s*(\S+)\s*")
 _FIX = "Write sample_id,score and then a line a candidate: docs/results/benchmark.md shows how"
 
@@ -50,17 +50,24 @@ class ScoreFile:
 def read_scores(path: Path) -> ScoreFile:
     """Read the file. InputError names the first wrong line."""
     text = read_regular(path, _MOST_BYTES, "Name a CSV file of scores").decode("utf-8-sig", errors="replace")
-    threshold, has_head = None, False
+    threshold, has_head, number = None, False, 1
     scores: dict[bytes, float] = {}
-    for number, line in enumerate(text.splitlines() or [""], start=1):
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip():
+            continue
         if line.startswith("#") and not has_head:
             if stated := _THRESHOLD.fullmatch(line):
+                if threshold is not None:
+                    raise InputError(path, f"line {number}", "states the threshold again", "State it once")
                 threshold = _number(path, number, "threshold", stated[1])
+            elif "threshold" in line.lower():  # else it would be 0.5 without a word
+                problem, fix = "states no threshold", "Write # threshold: NUMBER, or remove the line"
+                raise InputError(path, f"line {number}", problem, fix)
             continue
-        first, _, second = line.partition(",")
+        first, second = (part.strip() for part in line.partition(",")[::2])
         if not has_head:
-            if (first.strip(), second.strip()) != HEAD:
-                raise InputError(path, f"line {number}", f"is not {','.join(HEAD)}", _FIX)
+            if (first, second) != HEAD:
+                break
             has_head = True
             continue
         if not _ID.fullmatch(first):
@@ -73,6 +80,8 @@ def read_scores(path: Path) -> ScoreFile:
             problem = f"{score:g} is no probability, and no threshold is stated"
             fix = "Begin the file with a line: # threshold: NUMBER"
             raise InputError(path, f"line {number}", problem, fix)
+    if not has_head:
+        raise InputError(path, f"line {number}", f"is not {','.join(HEAD)}", _FIX)
     return ScoreFile(path.stem, str(path), 0.5 if threshold is None else threshold, threshold is None, scores)
 
 

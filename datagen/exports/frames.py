@@ -18,6 +18,7 @@ from datagen.schemas.run import Run
 from datagen.workers.houses import split_of
 from datagen.workers.rendering.noise import add_noise
 from datagen.workers.rendering.shading import draw_light, render_shaded
+from datagen.workers.scenes.generate import noise_of
 
 _STEP_M, _MOST_STEPS = 0.001, 65_535  # of depth
 _CAMERA = "x right, y down, z forward (OpenCV); the pixel in column u and row v has its centre at (u, v)"
@@ -32,11 +33,12 @@ def steps(source: ExportSource) -> Sequence[Step]:
 
 def _files(source: ExportSource, run: Run, rows: SceneRows) -> Iterator[NewFile]:
     scene, spec = source.rebuilt(run, rows.record), run.manifest.spec
-    place, camera = (scene.index, scene.retry), scene.camera
-    light = draw_light(camera, generator(spec.seed, Stream.LIGHT, *place))
+    camera = scene.camera
+    light = draw_light(camera, generator(spec.seed, Stream.LIGHT, scene.index, scene.retry))
     frame = render_shaded(scene.rays, scene.house.house, camera, light)
     if spec.observation.noise.enabled:  # the same as in the stored cloud
-        frame = add_noise(frame, spec.observation.noise, generator(spec.seed, Stream.NOISE, *place))
+        noise_rng = noise_of(scene, str(rows.record["room_id"]), spec)
+        frame = add_noise(frame, spec.observation.noise, noise_rng)
     depth = np.rint(frame.depth_m / _STEP_M)
     pictures = {
         "color": frame.rgb,

@@ -378,3 +378,8 @@ class Specification(Frozen):
         """Hash of the scenes and candidates: equal for runs that label the same ones, from one viewpoint."""
         stored = self.scenes_from
         return stored.spec_hash if stored is not None and stored.view is None else self.hash()
+
+    @property
+    def candidates_hash(self) -> str:
+        """Hash of the scenes and candidates: also equal for runs that see them from other viewpoints."""
+        return self.hash() if self.scenes_from is None else self.scenes_from.spec_hash

@@ -56,7 +56,7 @@ def candidates(
     fields = fields_of(paths, "candidates")
     valid = list(dict.fromkeys(name for of_path in fields for name in valid_columns(of_path)))
     refuse_unknown(columns or (), valid, "candidates")
-    names = list(columns) if columns is not None else [name for name in DEFAULT if name in valid]
+    names = [name for name in dict.fromkeys(DEFAULT if columns is None else columns) if name in valid]
     gathered: dict[str, list[Array]] = {name: [] for name in names}
     opened: list[RunPart] = []
     for path, of_path in zip(paths, fields, strict=True):

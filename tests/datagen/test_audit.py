@@ -14,6 +14,7 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, LedgerEntry
 from datagen.schemas.specification import ScenesFrom
 from tests.made_runs import make_run, rows_of, small_spec
+from tests.refusals import refused
 
 STAGES = {"draw": 0.2, "settle": 0.1, "observe": 0.1, "visibility": 0.5}
 
@@ -100,6 +101,9 @@ def test_a_terminal_shows_the_answers_in_a_dozen_lines_and_all_in_25(
     assert "heuristic equals heuristic for" in short
     assert cli.run(["audit", run.storage.url]) == 0
     assert "add the run that made its scenes" in capsys.readouterr().out
+    copy = make_run(tmp_path / "copy", n=10)
+    for other in (maker, copy):  # of one specification
+        refused(["audit", maker.storage.url, other.storage.url], capsys, "would count twice", "datagen merge")
     empty = make_run(tmp_path / "empty", n=50, shards=[])
     assert cli.run(["audit", empty.storage.url]) == 0
     assert "none of 0" in capsys.readouterr().out

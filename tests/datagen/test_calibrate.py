@@ -12,7 +12,7 @@ import pytest
 
 from datagen import cli
 from datagen.schemas.run import Run
-from datagen.schemas.specification import CandidateParams, HeuristicParams, Specification
+from datagen.schemas.specification import CandidateParams, HeuristicParams, ScenesFrom, Specification
 from datagen.workers.labels.distance_visibility_score import heuristic
 from tests.columns import columns_of
 from tests.made_runs import make_run, small_spec
@@ -135,6 +135,8 @@ def test_what_cannot_be_fitted_to_is_refused(
     refused(["calibrate", *out], capsys, "runs")
     refused(["calibrate", made("rules", small_spec()), *out], capsys, "label_source", "rule itself")
     refused(["calibrate", str(trials), str(trials), *out], capsys, "scenes", "another run")
+    view = trial_spec(scenes_from=ScenesFrom(spec_hash=Run.open(trials).manifest.spec_hash, view=1))
+    refused(["calibrate", str(trials), made("view", view), *out], capsys, "scenes", "another run")
     planned = small_spec(1, label_source="plan")
     refused(["calibrate", str(trials), made("plan", planned), *out], capsys, "plan", "sim")
     ruled = trial_spec(2, heuristic=HeuristicParams(mu=0.6))

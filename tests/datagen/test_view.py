@@ -57,6 +57,7 @@ def test_the_chosen_scenes_are_in_one_file(
     refused([*words, "--place", "roof"], capsys, "--place: roof", "Choose one of: floor, inside")
     refused([*words, "--disagreement", "heuristic"], capsys, "--disagreement: heuristic", "beside its own")
     refused([*words, "--outcome", "success"], capsys, "--outcome: success", "the run has none")
+    refused([*words, "--scene", "3"], capsys, "--scene: 3 is not in this run", "Give one from 0 to 2")
     refused([*words, "--object", "piano"], capsys, "no scene has all of these", "Give fewer filters")
     refused([*words[:-1], str(tmp_path / "scenes.png")], capsys, "is not a .rrd file")
 

@@ -47,6 +47,7 @@ from datagen.workers.world import PreparedHouse, World
 
 if TYPE_CHECKING:
     from datagen.workers.motion.reachable_set import ReachableSet
+    from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 # Objects that roll off the support touch no static part farther from it than this.
 _SURROUNDINGS_M = 0.3
@@ -169,6 +170,18 @@ def observe(
         return observe_cloud(cast, camera, 1, target_m, float(rays.radii_m[0]), params, rng)
 
     return camera, share, draw_cloud
+
+
+def noise_of(scene: ReconstructedScene, room_id: str, spec: Specification) -> np.random.Generator:
+    """The random numbers from which the depth noise of a stored scene's cloud was drawn."""
+    item: tuple[int, ...] = (scene.index, scene.retry)
+    if spec.scenes_from is not None and (view := spec.scenes_from.view) is not None:
+        try:
+            observe(scene.house, room_id, scene.geometry, scene.rays, spec, seen := (*item, view))
+            item = seen
+        except SceneRejected:  # no other place sees the target: the cloud is the first one
+            pass
+    return generator(spec.seed, Stream.NOISE, *item)
 
 
 def _reach_of(spec: Specification) -> ReachableSet | None:

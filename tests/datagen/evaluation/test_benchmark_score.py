@@ -14,6 +14,7 @@ import pytest
 
 from datagen import cli
 from datagen.evaluation.report import parts_by_place
+from datagen.evaluation.report_tables import grid_tables
 from tests.datagen.evaluation.conftest import checkpoint
 from tests.datagen.evaluation.made_columns import make_columns
 from tests.refusals import refused
@@ -58,6 +59,14 @@ def test_checkpoints_files_and_baselines_are_scored(
     )
     assert json.loads(out.read_text()) == report
     assert [m["name"] for m in report["methods"]] == ["tiny", "file", "proximity"]
+    # Reading a file is not the time of its method.
+    assert [m["seconds_per_600"] is None for m in report["methods"]] == [False, True, False]
+    table = next(grid_tables(report, next(part["grids"] for part in report["parts"] if part["grids"])))
+    assert {row[0]: row[-1] == "-" for row in table.rows[:3]} == {
+        "tiny": False,
+        "file": True,
+        "proximity": False,
+    }
     assert str(tmp_path) not in out.read_text() and str(small_benchmark) not in out.read_text()
     stored = arrays_of(small_benchmark / "test")
     label, score = stored["label"] == 1, near(stored)
@@ -159,6 +168,8 @@ def test_models_that_saw_held_out_houses_or_objects_are_refused(
         (f"sample_id,score\n{'0' * 32},nan\n", "line 2: score 'nan' is not a finite number"),
         (f"sample_id,score\n{'0' * 32},1\n{'0' * 32},1\n", "line 3: scores 0000"),
         (f"# threshold: y\nsample_id,score\n{'0' * 32},1\n", "line 1: threshold 'y' is not"),
+        (f"# Threshold = 0.3\nsample_id,score\n{'0' * 32},1\n", "line 1: states no threshold. Write # thr"),
+        (f"# threshold: 1\n# threshold: 2\nsample_id,score\n{'0' * 32},1\n", "line 2: states the thr"),
         (f"sample_id,score\n{'0' * 32},7\n", "is no probability, and no threshold is stated"),
     ],
 )
@@ -190,7 +201,9 @@ def test_a_file_states_its_threshold(
     text = (tmp_path / "low.csv").read_text()
     scores = np.array([float(line.split(",")[1]) for line in text.splitlines()[1:33]])
     threshold = float(np.median(scores))
-    (tmp_path / "high.csv").write_text(f"# threshold: {threshold}\n{text}")
+    head, *lines = text.splitlines()  # ids in capitals, and the empty lines of a writer on Windows
+    text = "\r\r\n".join([f"# threshold: {threshold}", head, *map(str.upper, lines), ""])
+    (tmp_path / "high.csv").write_bytes(text.encode())
     report = scores_of(capsys, runs, str(tmp_path / "low.csv"), str(tmp_path / "high.csv"))
     told = report["parts"][0]["sets"]["in-range"]["methods"]
     assert told["low"]["area_under_roc"] == told["high"]["area_under_roc"]

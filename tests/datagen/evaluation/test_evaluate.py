@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,10 @@ from datagen.evaluation.methods import EvaluatedMethod
 from datagen.evaluation.report import Part, evaluation_report
 from datagen.evaluation.runs import candidate_sets_of, open_evaluated_runs
 from datagen.evaluation.score_files import ScoreFile
+from datagen.schemas.run import Run
+from datagen.schemas.shard_files import encode_array
+from datagen.schemas.shard_reading import read_committed
+from datagen.train.baselines.rules import DistanceBand
 from datagen.train.models import build_model
 from datagen.train.training.checkpoints import (
     Checkpoint,
@@ -24,7 +29,7 @@ from datagen.train.training.checkpoints import (
 )
 from tests.datagen.evaluation.conftest import SIDE, checkpoint
 from tests.datagen.evaluation.made_columns import make_columns
-from tests.made_runs import make_run
+from tests.made_runs import make_run, resign
 from tests.sim_extra import needs_sim
 from tests.small_runs import arrays_of, json_of
 
@@ -193,6 +198,22 @@ def test_baselines_are_fitted_only_in_other_houses(
     assert distance["state"] and analytic["state"]["params"]["mu"] == 0.5 and analytic["threshold"] < 0.45
 
 
+def test_baselines_are_fitted_to_what_most_draws_call_good(
+    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(grids, tmp_path / "val")
+    run = Run.open(tmp_path / "val")
+    (field,) = (f for f in run.schema.sample_fields if f.name == "successes")
+    for commit in list(run.commits()):  # most draws contradict each label
+        most = 3 * (1 - read_committed(run, commit, ["label"])["label"].astype(np.int16))
+        resign(run, commit.attempt, encode_array(run.schema, run.layout, "sample", field, most))
+    chosen = ["--fit", str(tmp_path / "val"), "--allow-seen-houses", "--baselines", "distance"]
+    (distance,) = json_of(capsys, ["evaluate", str(grids), *chosen])["methods"]
+    (judged,) = open_evaluated_runs([str(tmp_path / "val")])
+    assert distance["state"] == DistanceBand().fit(list(judged.batches())).state()
+    assert distance["state"] != DistanceBand().fit(list(judged.stream.epoch(0))).state()
+
+
 def test_bad_input_is_refused_in_one_line(
     grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -200,7 +221,11 @@ def test_bad_input_is_refused_in_one_line(
     (tmp_path / "thesis.tex").write_text("text")
     odd = tmp_path / "odd.toml"
     odd.write_text('[heuristic]\nmu = "far"\n')
-    heuristic = make_run(tmp_path / "heuristic").storage.url
+    (rule := tmp_path / "rule.toml").write_text("[heuristic]\nmu = 0.5\n")
+    near = grids.parent / "test"
+    heuristic, view = make_run(tmp_path / "heuristic").storage.url, str(tmp_path / "view")
+    seen_again = ["--scenes-from", run, "--view", "1", "--n", str(SCENES * CELLS), "--out", view]
+    assert cli.run(["submit", "plan", *seen_again, "--workers", "0"]) == 0
     cases: list[tuple[list[str], list[str]]] = [
         ([file], ["PATH", "no run is given"]),
         ([file, str(tmp_path / "none")], ["none", "neither a checkpoint file nor a run folder"]),
@@ -209,11 +234,14 @@ def test_bad_input_is_refused_in_one_line(
         ([run, "--baselines", "none"], ["PATH", "no model or baseline given"]),
         ([file, file, run], ["METHOD: c: is the name of two methods"]),
         ([file, run, run], ["sample_id", "occurs twice"]),
+        ([file, run, view], ["view: scenes: are also in another run", "another viewpoint"]),
         ([file, run, "--baselines", "luck"], ["--baselines: luck: is not a baseline"]),
         ([file, run, "--baselines", "scalars"], ["--baselines: scalars", "--fit"]),
         ([file, run, "--fit", heuristic, "--baselines", "distance"], ["label_source: is heuristic"]),
         ([file, run, "--heuristic", str(tmp_path / "thesis.tex"), *QUICK], ["thesis.tex", "is not TOML"]),
         ([file, run, "--heuristic", str(odd), *QUICK], ["odd.toml: heuristic.mu", "given: far"]),
+        ([file, run, "--heuristic", str(rule), *QUICK], ["rule.toml: is for the baseline analytic"]),
+        ([file, str(near), "--arrival", "nav2"], ["--arrival: is for picks on whole grids"]),
         ([file, run, "--out", "page.html"], ["--out", "not a .json file"]),
         ([file, run, "--out", str(tmp_path / "no" / "page.json")], ["--out", "folder does not exist"]),
         ([file, run, "--arrival", "ring:1"], ["--arrival: ring:1"]),

@@ -77,6 +77,7 @@ def test_a_lonely_good_cell_fails_where_a_wide_region_does_not() -> None:
     )
     at = {row["arrival"]: row["methods"]["model"] for row in found}
     assert at["0 m off"]["nominal"]["value"] == at["0 m off"]["smoothed"]["value"] == 1
+    assert at["0 m off"]["nominal"]["low"] == pytest.approx(0.025 ** (1 / columns.n_scenes))  # exact
     assert at["0.1 m off"]["nominal"]["value"] < 0.6
     assert at["0.1 m off"]["smoothed"]["value"] > 0.999
     np.testing.assert_allclose([row["best"] for row in found[:4]], 1)

@@ -6,6 +6,7 @@ import json
 import shutil
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pandas
 import pytest
@@ -150,6 +151,9 @@ def test_merged_runs_are_exported_as_one_and_scenes_are_counted_over_them(tmp_pa
     some = pandas.read_parquet(tmp_path / "some/candidates")
     chosen = table["scene_id"].isin(table["scene_id"].unique()[5:9])
     pandas.testing.assert_frame_equal(some, table[chosen].reset_index(drop=True))
+    number: Any = 6  # in place of its text
+    one = datagen.export(tmp_path / "merged", to="parquet", out=tmp_path / "one", scenes=number)
+    assert one["scenes"] == 1
 
 
 def test_cards_and_stores_state_the_licences_of_what_was_used(tmp_path: Path) -> None:

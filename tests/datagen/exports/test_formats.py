@@ -167,6 +167,13 @@ def test_frames_have_the_stored_points_in_a_folder_that_predict_reads(
         np.testing.assert_allclose(
             answer["target"]["center_m"], record["target_center_m"], atol=0.06 if noisy else 0.04
         )
+    view = tmp_path / "view"
+    again = ["--scenes-from", str(run), "--view", "1", "--n", str(3 * PER_SCENE), "--workers", "0"]
+    assert cli.run(["submit", "heuristic", *again, "--out", str(view)]) == 0
+    out = export(view, "frames", tmp_path / "seen")
+    for line in map(json.loads, (out / "frames.jsonl").read_text().splitlines()):
+        record = read_scene(Run.open(view), line["scene_index"]).record
+        _assert_stored_points(out / line["frame"], line, record)
 
 
 def _assert_stored_points(folder: Path, line: dict[str, Any], record: Mapping[str, Any]) -> None:

@@ -104,7 +104,7 @@ def test_a_table_joins_candidates_with_their_scenes(runs: tuple[Path, Path]) -> 
 
 
 def test_columns_are_chosen_by_name_and_wrong_ones_list_the_valid(runs: tuple[Path, Path]) -> None:
-    table = datagen.candidates(runs[0], columns=["sample_id", "retry", "label"])
+    table = datagen.candidates(runs[0], columns=["sample_id", "retry", "label", "retry"])  # once each
     assert table.columns.tolist() == ["sample_id", "retry", "label"]
     assert table["sample_id"].nunique() == 40 and len(str(table["sample_id"][0])) == 32
     with pytest.raises(datagen.InputError, match=r"columns: labels: .* Choose one of: arm_reach_m, base_"):
