@@ -247,8 +247,11 @@ class HandMeasures:
             # As far apart as a box of the pads' size fits between them.
             half = np.array([pad_size_m[0], np.inf, pad_size_m[1]]) / 2
             inner = [self._nearest(at, side, middle - half, middle + half) for side in (1, -1)]
+            if not np.isfinite(inner).all():  # the pads have swung past one another
+                opening[k:] = 0.0
+                break
             opening[k] = max(inner[0] - inner[1], 0.0)
-            if np.isfinite(inner).all() and abs(sum(inner)) / 2 > _CENTRED_M:
+            if abs(sum(inner)) / 2 > _CENTRED_M:
                 fix = "Correct hand.tcp, or name joints of both fingers in hand.fingers"
                 raise self._wrong("hand", "its fingers do not close on the middle of its TCP", fix)
         end = int(np.argmax(opening)) + 1

@@ -21,6 +21,7 @@ from datagen.workers.robots import (
     robot_limits,
     robot_source,
 )
+from datagen.workers.robots.assembly import assemble
 from datagen.workers.robots.urdf import read_urdf
 from tests.sim_extra import needs_robots
 
@@ -176,6 +177,16 @@ def test_links_with_a_visual_alone_are_named_and_refused_where_no_other_moves(
     bare = seen_only(make(folder="b"), "mast", "shoulder", "upper", "lower", "wrist")
     with pytest.raises(InputError, match=r"robot\.toml: arm: no link that moves has a shape"):
         open_robot(bare, None, 0.85)
+
+
+@needs_robots
+def test_fingers_that_swing_past_one_another_open_as_far_as_they_face(tmp_path: Path) -> None:
+    file = tmp_path / "alex.toml"
+    urdf = "package:example-robot-data/robots/alex_description/urdf/alex_sake_hands.urdf"
+    file.write_text(f'urdf = "{urdf}"\n[arm]\nbase = "Torso"\ntip = "LeftSakePalmLink"\n')
+    linkage = assemble(robot_source(str(file)), None).hand.gripper.linkage  # fingers turn by 1.9 rad
+    assert linkage is not None and (np.diff(linkage.opening_m) > 0).all()
+    assert linkage.opening_m[-1] == pytest.approx(0.032, abs=0.001)
 
 
 @needs_robots
