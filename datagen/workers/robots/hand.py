@@ -38,7 +38,8 @@ def hand_of(source: RobotSource, tree: UrdfTree, palm: str) -> Hand:
         clusters[name] = cluster_of(tree, name, {joint.name for joint in joints}, held)
         bodies[name] = body_of(name, clusters[name])
     if not bodies[palm].parts_m:
-        raise source.wrong("hand.palm", f"link {palm} has no collision shape", "Name the palm of the hand")
+        fix = "Name the palm of the hand, or give it <collision>, to which a <visual> does not count"
+        raise source.wrong("hand.palm", f"link {palm} has no collision shape", fix)
     carried = {joint.child: next(n for n, c in clusters.items() if joint.parent in c) for joint in joints}
     for joint in reversed(joints):  # joints that move no shape
         if not bodies[joint.child].parts_m and joint.child not in carried.values():

@@ -215,6 +215,9 @@ class HandMeasures:
                 q = (low + high) / 2
                 low, high = (q, high) if surfaces(q)[0].min() < 0 else (low, q)
             q, (gap, sides) = high, surfaces(high)
+            if gap.min() < 0:
+                fix = "Give [hand.range], or curved fingers a <collision> of convex parts"
+                raise self._wrong("hand", "its fingers overlap even when they are open", fix)
         if not np.isfinite(gap).any():
             fix = "Correct hand.tcp, hand.fingers or hand.range"
             raise self._wrong("hand", "its fingers do not meet: the hand cannot close on anything", fix)
@@ -252,7 +255,7 @@ class HandMeasures:
                 break
             opening[k] = max(inner[0] - inner[1], 0.0)
             if abs(sum(inner)) / 2 > _CENTRED_M:
-                fix = "Correct hand.tcp, or name joints of both fingers in hand.fingers"
+                fix = "Correct hand.tcp, or name the joints of two opposite fingers in hand.fingers"
                 raise self._wrong("hand", "its fingers do not close on the middle of its TCP", fix)
         end = int(np.argmax(opening)) + 1
         falling = np.flatnonzero(np.diff(opening[:end]) <= 0)
@@ -260,6 +263,8 @@ class HandMeasures:
         opening, depth, coordinate = opening[some], depth[some], coordinate[some]
         if len(opening) < 2 or opening[-1] < _LEAST_OPENING_M:
             problem = f"opens by {1000 * float(opening[-1]):.1f} mm: the hand cannot close on anything"
+            if opening[-1] >= _LEAST_OPENING_M:
+                problem = "its fingers do not part between the closed and the open position"
             raise self._wrong("hand", problem, "Give the closed and open positions in [hand.range]")
         closed, tree = self._poses(float(coordinate[0])), self._tree
         T_first = np.matmul(inverse(self.T_palm_tcp), tree.T_parent_joint)

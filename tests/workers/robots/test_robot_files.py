@@ -276,6 +276,8 @@ def test_a_digest_depends_on_content_and_not_on_the_place(make: Made) -> None:
         (("", ""), (LIMIT.format(-1.5, 1.5), ""), "", r"tilt: has no limit"),
         (("", ""), ('multiplier="-1"', 'multiplier="0"'), "", r"hand: .*middle of its TCP"),
         (("", ""), ("", ""), "[hand.range]\nopen = [0.0, 0.01]\n", r"opens by [0-9.]+ mm: the hand"),
+        (("", ""), ("", ""), "[hand.range]\nopen = [0.6, 0.0]\n", r"hand: its fingers do not part between"),
+        (("", ""), ("0.12 0.01 0.02", "0.12 0.3 0.02"), "", r"hand: its fingers overlap even when they are open"),
         (("", ""), ("", ""), '[hand]\nfingers = ["gone"]\n', r"joint gone: is missing"),
         (("", ""), ("", ""), "[hand.range]\nopen = [0.0, 0.5]\ngone = [0.0, 0.1]\n", r"gone: is missing"),
         (('tip = "palm"', 'tip = "palm"\nignore = ["left", "right"]'), ("", ""), "", r"palm has a shape"),
