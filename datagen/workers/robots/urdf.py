@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -162,6 +163,10 @@ def read_urdf(path: Path) -> UrdfTree:
     reader = _Reader(path, root)
     links = {link.name: link for link in map(reader.link, root.findall("link"))}
     joints = {joint.name: joint for joint in map(reader.joint, root.findall("joint"))}
+    for kind in ("link", "joint"):
+        names = Counter(element.get("name") for element in root.findall(kind))
+        if repeated := next((name for name, count in names.items() if count > 1), None):
+            raise _wrong(path, f"{kind} {repeated}", f"is the name of {names[repeated]} {kind}s")
     for joint in joints.values():
         for end in (joint.parent, joint.child):
             if end not in links:
