@@ -138,12 +138,14 @@ class UrdfTree:
             return -np.pi, np.pi
         if math.isinf(joint.lower):
             raise _wrong(self.path, f"joint {joint.name}", "has no limit")
-        if not joint.lower < joint.upper:
-            problem = f"its range {joint.lower} to {joint.upper} is empty"
+        lower, upper = joint.lower, joint.upper
+        if joint.kind == "revolute":
+            lower, upper = max(lower, -2 * np.pi), min(upper, 2 * np.pi)
+        if not lower < upper:
+            part = " within two turns each way" if joint.lower < joint.upper else ""
+            problem = f"its range {joint.lower} to {joint.upper} is empty{part}"
             raise _wrong(self.path, f"joint {joint.name}", problem)
-        if joint.kind == "prismatic":
-            return joint.lower, joint.upper
-        return max(joint.lower, -2 * np.pi), min(joint.upper, 2 * np.pi)
+        return lower, upper
 
 
 def read_urdf(path: Path) -> UrdfTree:
