@@ -258,8 +258,8 @@ class _Reader:
             solid = element.find(f"geometry/{kind}")
             if solid is not None:
                 size_m = np.concatenate([self.numbers(solid, key, n, where, "") for key, n in keys])
-                if not (size_m > 0).all():
-                    raise _wrong(self.path, where, f"its {kind} has no volume")
+                if (size_m < 0).any():
+                    raise _wrong(self.path, where, f"its {kind} has a negative size")
                 return Shape(T, size_m, None, np.ones(3), self.path, where, rgb)
         mesh = element.find("geometry/mesh")
         if mesh is None:

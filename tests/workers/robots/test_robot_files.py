@@ -274,10 +274,15 @@ def test_a_digest_depends_on_content_and_not_on_the_place(make: Made) -> None:
         ((ENDS, 'base = "palm"\ntip = "base"'), ("", ""), "", r"not below link palm"),
         (("", ""), ('type="continuous"', 'type="floating"'), "", r"joint pan: is floating"),
         (("", ""), (LIMIT.format(-1.5, 1.5), ""), "", r"tilt: has no limit"),
+        (("", ""), (LIMIT.format(-1.5, 1.5), LIMIT.format(7, 8)), "", r"tilt: its range 7.0 to 8.0 is empty within"),
+        (("", ""), ('link name="left"', 'link name="upper"'), "", r"robot\.urdf: link upper: is the name of 2 links"),
+        (("", ""), ('joint name="roll"', 'joint name="pan"'), "", r"robot\.urdf: joint pan: is the name of 2 jo"),
+        (("", ""), ('box size="0.35 ', 'box size="0 '), "", r"upper collision: has no volume.*arm\.ignore"),
+        (("", ""), ('box size="0.35 ', 'box size="-0.35 '), "", r"upper collision: its box has a negative size"),
         (("", ""), ('multiplier="-1"', 'multiplier="0"'), "", r"hand: .*middle of its TCP"),
         (("", ""), ("", ""), "[hand.range]\nopen = [0.0, 0.01]\n", r"opens by [0-9.]+ mm: the hand"),
         (("", ""), ("", ""), "[hand.range]\nopen = [0.6, 0.0]\n", r"hand: its fingers do not part between"),
-        (("", ""), ("0.12 0.01 0.02", "0.12 0.3 0.02"), "", r"hand: its fingers overlap even when they are open"),
+        (("", ""), ("0.12 0.01 0.02", "0.12 0.3 0.02"), "", r"fingers overlap even when they are open"),
         (("", ""), ("", ""), '[hand]\nfingers = ["gone"]\n', r"joint gone: is missing"),
         (("", ""), ("", ""), "[hand.range]\nopen = [0.0, 0.5]\ngone = [0.0, 0.1]\n", r"gone: is missing"),
         (('tip = "palm"', 'tip = "palm"\nignore = ["left", "right"]'), ("", ""), "", r"palm has a shape"),
@@ -355,6 +360,8 @@ def test_a_missing_visual_mesh_and_a_link_without_length_do_not_block(make: Made
     path = make(urdf=('<link name="upper">', f'<link name="upper">{visual}'))
     robot = open_robot(path, None, 0.85)
     assert [len(m.faces) > 0 for m in robot.link_meshes()] == [bool(p) for p in robot.link_parts_m]
+    placeholder = '<visual><geometry><box size="0 0 0"/></geometry></visual>'  # as in Sawyer's URDF
+    assert open_robot(make(urdf=('<link name="upper">', f'<link name="upper">{placeholder}')), None, 0.85)
     short = make(urdf=('"0.42 0 0"', '"0 0 0"'), folder="b")
     assert open_robot(short, None, 0.85).reach_m < robot.reach_m
 
