@@ -90,6 +90,10 @@ def _moving(source: RobotSource, tree: UrdfTree, palm: str) -> list[Joint]:
             )
             if moves and (not keys.fingers or driver in keys.fingers):
                 found.append(joint)
+    drivers = {tree.driver(joint)[0].name for joint in found}
+    for field, names in (("hand.fingers", keys.fingers), ("hand.range", keys.range)):
+        if other := next((name for name in names if name not in drivers), None):
+            raise source.wrong(field, f"joint {other} does not open the hand", f"Name one below {palm}")
     if not found:
         raise source.wrong("hand.palm", f"no joint moves below link {palm}", "Name the palm in hand.palm")
     return found
