@@ -103,7 +103,7 @@ def _sdf(path: Path) -> Description:
                 if shape.find("material/diffuse") is not None:
                     rgb = tuple(_text(path, shape, "material/diffuse", 4, "1 1 1 1")[:3])
                 uri, image = (
-                    _model_path(text.strip(), path) if (text := shape.findtext(tag, "")) else None
+                    mesh_path(text.strip(), path) if (text := shape.findtext(tag, "")) else None
                     for tag in ("geometry/mesh/uri", "material/pbr/metal/albedo_map")
                 )
                 scale = _text(path, shape, "geometry/mesh/scale", 3, "1 1 1")
@@ -120,11 +120,6 @@ def _sdf_pose(path: Path, element: Element) -> F64:
     numbers, T = _text(path, element, "pose", 6, "0 0 0 0 0 0"), np.eye(4)
     T[:3, :3], T[:3, 3] = rpy_rotation(numbers[3:]), numbers[:3]
     return T
-
-
-def _model_path(uri: str, path: Path) -> Path:
-    """`model://NAME/path` is searched like a ROS package's."""
-    return mesh_path(uri.replace("model://", "package://", 1), path)
 
 
 class _Mjcf:

@@ -109,6 +109,13 @@ def test_everything_is_derived_from_a_file_of_five_lines(make: Made) -> None:
     assert len(robot.homes_rad) >= 4 and not any(robot.collides_itself(q) for q in robot.homes_rad)
 
 
+def test_a_mark_and_line_ends_of_windows_change_no_robot(make: Made) -> None:
+    plain, other = make(), make(folder="b")
+    for file in (Path(other), Path(other).with_name("robot.urdf")):
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
+    assert robot_limits(other) == robot_limits(plain)
+
+
 def test_pads_are_whole_faces_of_fingers_that_touch_with_an_edge(make: Made) -> None:
     # From 0.15 rad on, the fingers diverge: of 12 cm the outer half counts, which moves apart enough.
     gripper = open_robot(make(more="[hand.range]\nopen = [0.15, 0.6]\n"), None, 0.85).gripper
@@ -341,7 +348,17 @@ def test_meshes_of_every_format_are_read_and_broken_ones_refused(make: Made, tmp
         robot = open_robot(path, None, 0.85)
         part, wanted = robot.link_parts_m[3][0], plain.link_parts_m[3][0]
         np.testing.assert_allclose(np.sort(part, axis=0), np.sort(wanted, axis=0), atol=1e-6)
+    path = make(urdf=(box, '<mesh filename="model://arm/upper.dae"/>'), folder="unit")  # as in Gazebo's files
+    (tmp_path / "unit/arm").mkdir()
+    mesh.apply_scale(100.0).export(tmp_path / "unit/arm/upper.dae")
+    text = (tmp_path / "unit/arm/upper.dae").read_text().replace("<up_axis>", "<unit meter='0.01'/><up_axis>")
+    (tmp_path / "unit/arm/upper.dae").write_text(text)
+    part = open_robot(path, None, 0.85).link_parts_m[3][0]
+    np.testing.assert_allclose(np.sort(part, axis=0), np.sort(plain.link_parts_m[3][0], axis=0), atol=1e-6)
     for name, content, said in (
+        ("package://arm/gone.stl", None, r"arm/gone.stl: cannot be read.*package://NAME is a folder"),
+        ("a.step", b"ISO", r"a.step: is not a mesh .*Convert it to OBJ, STL"),
+        ("in_mm.stl", trimesh.creation.box((350.0, 60.0, 60.0)).export(file_type="stl"), "is 350 m large"),
         ("gone.stl", None, "gone.stl: cannot be read"),
         ("bad.dae", b"<COLLADA>", r"bad.dae: (is not a mesh|needs)"),
         ("bad.glb", b"glTF" + bytes(40), "bad.glb: is not a mesh"),
