@@ -210,7 +210,7 @@ def _read(path: Path, _stamp: int) -> RobotSource:
     try:
         fields: dict[str, Any] = tomllib.loads(
             data.decode("utf-8-sig")
-        )  # after the byte order mark of some editors
+        )
         return RobotSource(path, RobotFile.model_validate(fields))
     except ValidationError as error:
         raise _first_of(error, path) from None
