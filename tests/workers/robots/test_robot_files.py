@@ -217,6 +217,22 @@ HAND = "".join(
 )
 
 
+@pytest.mark.parametrize(
+    "tcp", ["", "pad_size_m = [0.02, 0.02]\ntcp.xyz_m = [0.1, 0, 0]\ntcp.approach = 'x'\n"]
+)
+def test_sliding_fingers_that_stand_apart_when_closed_open_by_what_lies_between_them(
+    make: Made, tcp: str
+) -> None:
+    hand = HAND.replace("0.1 0.006 0", "0.1 0.015 0").replace("0.1 -0.006 0", "0.1 -0.015 0")
+    ranges = "range = { pan = [0, 0.04], elbow = [0, 0.04] }\n"
+    more = f'[hand]\nurdf = "hand.urdf"\npalm = "palm"\n{ranges}{tcp}'
+    name = make(('tip = "palm"', 'tip = "wrist"'), more=more)
+    Path(name).with_name("hand.urdf").write_text(f"<robot name='h'>{hand}</robot>")
+    gripper = assemble(robot_source(name), None).hand.gripper  # fingers of 10 mm, their middles 30 mm apart
+    assert gripper.max_opening_m == pytest.approx(0.1)
+    assert gripper.linkage is not None and gripper.linkage.opening_m[0] == pytest.approx(0.02)
+
+
 def test_fingers_without_limits_and_with_names_of_the_arm_move_in_physics(make: Made) -> None:
     pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
     from datagen.workers.trials.physics import TrialWorld
