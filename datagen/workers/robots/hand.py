@@ -36,7 +36,7 @@ def hand_of(source: RobotSource, tree: UrdfTree, palm: str) -> Hand:
     clusters, bodies = dict[str, Cluster](), dict[str, LinkBody]()
     for name in (palm, *(joint.child for joint in joints)):
         clusters[name] = cluster_of(tree, name, {joint.name for joint in joints}, held)
-        bodies[name] = body_of(name, clusters[name])
+        bodies[name] = body_of(name, clusters[name], cuts_m=source.keys.arm.cuts_m)
     if not bodies[palm].parts_m:
         fix = "Name the palm of the hand, or give it <collision>, to which a <visual> does not count"
         raise source.wrong("hand.palm", f"link {palm} has no collision shape", fix)

@@ -122,7 +122,9 @@ def _hulls_of(path: Path, cuts_m: tuple[float, ...]) -> tuple[F64, ...]:
         return tuple(outer_hull(_slab(points, edges, low, high)) for low, high in itertools.pairwise(bounds))
     except (QhullError, ValueError):
         if cuts_m:
-            raise _wrong(path, f"has no body between two of the cuts {cuts_m} of arm.cuts_m") from None
+            z = f"it reaches from z = {points[:, 2].min():.4g} to {points[:, 2].max():.4g} in its units"
+            problem = f"has no body between two of the cuts {cuts_m}: {z}"
+            raise InputError(path, "", problem, "Correct arm.cuts_m, in metres") from None
     # A label or a marker: a sheet of no thickness gets one.
     thick = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2] * _SHEET_M
     try:

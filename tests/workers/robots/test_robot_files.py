@@ -391,6 +391,24 @@ def test_meshes_of_every_format_are_read_and_broken_ones_refused(make: Made, tmp
         robot_limits(path)
 
 
+def test_meshes_of_the_hand_are_cut_and_cuts_beside_a_mesh_are_named(make: Made) -> None:
+    import trimesh
+
+    for folder, height_m, parts in (("a", 0.01, 2), ("b", 0.05, 0)):
+        cuts = ('"palm"\n', f'"palm"\ncuts_m = {{ palm = [{height_m}] }}\n')
+        shape = '<mesh filename="palm.stl" scale="0.001 0.001 0.001"/>'
+        path = make(cuts, ('<box size="0.06 0.12 0.06"/>', shape), folder)
+        trimesh.creation.box((60.0, 120.0, 60.0)).export(Path(path).with_name("palm.stl"))
+        if parts:
+            palm = assemble(robot_source(path), None).hand.bodies[0]
+            assert sorted(float(np.ptp(part[:, 2])) for part in palm.parts_m) == pytest.approx([0.02, 0.04])
+            continue
+        with pytest.raises(
+            InputError, match=r"palm\.stl: .*\(50\.0,\): it reaches from z = -30 to 30 in its"
+        ):
+            assemble(robot_source(path), None)
+
+
 def test_a_missing_visual_mesh_and_a_link_without_length_do_not_block(make: Made) -> None:
     visual = '<visual><geometry><mesh filename="gone.dae"/></geometry></visual>'
     path = make(urdf=('<link name="upper">', f'<link name="upper">{visual}'))
