@@ -221,7 +221,7 @@ HAND = "".join(
     "tcp", ["", "pad_size_m = [0.02, 0.02]\ntcp.xyz_m = [0.1, 0, 0]\ntcp.approach = 'x'\n"]
 )
 def test_sliding_fingers_that_stand_apart_when_closed_open_by_what_lies_between_them(
-    make: Made, tcp: str
+    make: Made, tcp: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     hand = HAND.replace("0.1 0.006 0", "0.1 0.015 0").replace("0.1 -0.006 0", "0.1 -0.015 0")
     ranges = "range = { pan = [0, 0.04], elbow = [0, 0.04] }\n"
@@ -231,6 +231,8 @@ def test_sliding_fingers_that_stand_apart_when_closed_open_by_what_lies_between_
     gripper = assemble(robot_source(name), None).hand.gripper  # fingers of 10 mm, their middles 30 mm apart
     assert gripper.max_opening_m == pytest.approx(0.1)
     assert gripper.linkage is not None and gripper.linkage.opening_m[0] == pytest.approx(0.02)
+    assert cli.run(["robot", name]) == 0
+    assert "palm and 2 sliding bodies" in capsys.readouterr().out
 
 
 def test_fingers_without_limits_and_with_names_of_the_arm_move_in_physics(make: Made) -> None:
