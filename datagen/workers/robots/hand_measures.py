@@ -23,6 +23,10 @@ _NEXT_M = 1e-6  # between lines on one face
 _MOVES = 0.5  # pads are where the fingers move apart by at least this share of the most
 _LEAST_OPENING_M, _CENTRED_M, _APART_M = 0.005, 0.004, 0.002
 _HALVINGS = 14
+_OVERLAP = (
+    "its fingers overlap even when they are open",
+    "Leave out links with arm.ignore, give curved ones convex <collision> parts, or correct [hand.range]",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,8 +226,7 @@ class HandMeasures:
                 low, high = (q, high) if surfaces(q)[0].min() < 0 else (low, q)
             q, (gap, sides) = high, surfaces(high)
             if gap.min() < 0:
-                fix = "Give [hand.range], or curved fingers a <collision> of convex parts"
-                raise self._wrong("hand", "its fingers overlap even when they are open", fix)
+                raise self._wrong("hand", *_OVERLAP)
         if not np.isfinite(gap).any():
             fix = "Correct hand.tcp, hand.fingers or hand.range"
             raise self._wrong("hand", "its fingers do not meet: the hand cannot close on anything", fix)
@@ -263,6 +266,8 @@ class HandMeasures:
             if abs(sum(inner)) / 2 > _CENTRED_M:
                 fix = "Correct hand.tcp, or name the joints of two opposite fingers in hand.fingers"
                 raise self._wrong("hand", "its fingers do not close on the middle of its TCP", fix)
+        if not opening.any():
+            raise self._wrong("hand", *_OVERLAP)
         end = int(np.argmax(opening)) + 1
         falling = np.flatnonzero(np.diff(opening[:end]) <= 0)
         some = slice(int(falling[-1]) + 1 if len(falling) else 0, end)

@@ -187,6 +187,21 @@ def test_links_with_a_visual_alone_are_named_and_refused_where_no_other_moves(
 
 
 @needs_robots
+def test_fingers_whose_carriages_overlap_are_refused_and_grip_with_their_tips(tmp_path: Path) -> None:
+    file = tmp_path / "baxter.toml"
+    urdf = "package:example-robot-data/robots/baxter_description/urdf/baxter.urdf"
+    text = f'urdf = "{urdf}"\n[arm]\nbase = "base"\ntip = "left_gripper_base_link"\n'
+    file.write_text(text)
+    with pytest.raises(InputError, match=r"baxter\.toml: hand: its fingers overlap .* with arm\.ignore"):
+        assemble(robot_source(str(file)), None)
+    tips = tmp_path / "tips.toml"
+    tips.write_text(text + 'ignore = ["l_gripper_l_finger", "l_gripper_r_finger"]\n')
+    linkage = assemble(robot_source(str(tips)), None).hand.gripper.linkage
+    assert linkage is not None  # boxes at 11.25 mm of 6.5 mm, that slide by 20.833 mm each
+    np.testing.assert_allclose(linkage.opening_m[[0, -1]], (0.016, 0.016 + 2 * 0.020833), atol=1e-5)
+
+
+@needs_robots
 def test_fingers_that_swing_past_one_another_open_as_far_as_they_face(tmp_path: Path) -> None:
     file = tmp_path / "alex.toml"
     urdf = "package:example-robot-data/robots/alex_description/urdf/alex_sake_hands.urdf"
