@@ -259,9 +259,9 @@ class HandMeasures:
             # As far apart as a box of the pads' size fits between them.
             half = np.array([pad_size_m[0], np.inf, pad_size_m[1]]) / 2
             inner = [self._nearest(at, side, middle - half, middle + half) for side in (1, -1)]
-            if not np.isfinite(inner).all():  # the pads have swung past one another
-                opening[k:] = 0.0
-                break
+            if not np.isfinite(inner).all():
+                fix = "Name the joints of two opposite fingers in hand.fingers, or a smaller [hand.range]"
+                raise self._wrong("hand", "its fingers swing past one another before they are open", fix)
             opening[k] = max(inner[0] - inner[1], 0.0)
             if abs(sum(inner)) / 2 > _CENTRED_M:
                 fix = "Correct hand.tcp, or name the joints of two opposite fingers in hand.fingers"
