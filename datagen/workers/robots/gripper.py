@@ -12,6 +12,7 @@ from datagen.workers.kinematics.tree import Ints, KinematicTree, frame_poses
 
 Parts = tuple[F32, ...]  # convex parts, each (V, 3)
 _Y = np.array([0.0, 1.0, 0.0], np.float32)
+_GIVE_M = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +52,11 @@ class Gripper:
     def side(self) -> Ints:
         """(B,) 1 and -1 for bodies on the sides of +y and -y, 0 for the palm."""
         return np.array([0, 1, -1]) if self.linkage is None else self.linkage.side
+
+    @property
+    def least_width_m(self) -> float:
+        """Width of the thinnest object between the pads: these give, or lack their rubber in the URDF."""
+        return 0.0 if self.linkage is None else max(float(self.linkage.opening_m[0]) - _GIVE_M, 0.0)
 
     def body_poses(self, opening_m: F64) -> F64:
         """Poses (M, B, 4, 4) of the bodies in the TCP frame with the pads `opening_m` (M,) apart."""

@@ -14,6 +14,7 @@ pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run 
 from datagen import cli
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import TrialParams
+from datagen.workers.grasps.search import hand_poses_of
 from datagen.workers.robots import (
     open_robot,
     remember,
@@ -24,6 +25,7 @@ from datagen.workers.robots import (
 from datagen.workers.robots.assembly import assemble
 from datagen.workers.robots.urdf import read_urdf
 from tests.sim_extra import needs_robots
+from tests.workers.worlds import box_model
 
 # A 5-joint arm of plain solids on a box, with a hand of two fingers that pivot.
 LINKS = {
@@ -249,6 +251,20 @@ def test_sliding_fingers_that_stand_apart_when_closed_open_by_what_lies_between_
     assert gripper.linkage is not None and gripper.linkage.opening_m[0] == pytest.approx(0.02)
     assert cli.run(["robot", name]) == 0
     assert "palm and 2 sliding bodies" in capsys.readouterr().out
+
+
+def test_a_hand_grasps_nothing_thinner_than_what_lies_between_its_closed_pads(make: Made) -> None:
+    hand = HAND.replace("0.1 0.006 0", "0.1 0.035 0").replace("0.1 -0.006 0", "0.1 -0.035 0")
+    ranges = "range = { pan = [0, 0.04], elbow = [0, 0.04] }\n"
+    name = make(
+        ('tip = "palm"', 'tip = "wrist"'), more=f'[hand]\nurdf = "hand.urdf"\npalm = "palm"\n{ranges}'
+    )
+    Path(name).with_name("hand.urdf").write_text(f"<robot name='h'>{hand}</robot>")
+    gripper = assemble(robot_source(name), None).hand.gripper  # its pads stay 60 mm apart, and may give by 10
+    assert gripper.least_width_m == pytest.approx(0.05)
+    rng = np.random.default_rng(0)
+    thin, wide = (hand_poses_of(box_model("box", (side_m,) * 3), gripper, rng) for side_m in (0.025, 0.055))
+    assert len(thin.opening_m) == 0 and len(wide.opening_m) > 50
 
 
 def test_fingers_without_limits_and_with_names_of_the_arm_move_in_physics(make: Made) -> None:
