@@ -84,7 +84,8 @@ def _hand(robot: Robot) -> Rows:
     palm, *fingers = robot.link_names[robot.first_hand_link :]
     kind, least_m = "sliding", 0.0
     if gripper.linkage is not None:
-        kind, least_m = "turning", float(gripper.linkage.opening_m[0])
+        kind = "sliding" if gripper.linkage.tree.slides.all() else "turning"
+        least_m = float(gripper.linkage.opening_m[0])
     shut, wide = (1000 * gripper.pad_depth_m(np.array([least_m, gripper.max_opening_m]))).round() + 0.0
     pads = " x ".join(f"{1000 * size:.0f}" for size in gripper.pad_size_m)
     x, y, z = T[:3, 3].round(3) + 0.0

@@ -23,7 +23,7 @@ def read_toml(
     """The content of a TOML file. InputError, with `fix`, where it is not TOML, too large or unreadable."""
     data = read_regular(path, _MAX_BYTES, fix)
     try:
-        text = data.decode()
+        text = data.decode("utf-8-sig")  # after the byte order mark of some editors
         # The parser's memory grows with the square of the parts of a key.
         if max(part.count(".") for part in _BETWEEN.split(_TEXT.sub("", text))) >= _MOST_PARTS:
             raise ValueError(f"a key has more than {_MOST_PARTS} parts")

@@ -198,6 +198,8 @@ def content_digest(model: ObjectModel, gripper: Gripper, draw: int = 0) -> str:
     other: dict[str, Any] = {"draw": draw} if draw else {}
     if gripper.linkage is not None:
         other["linkage"] = [_TURNING, gripper.digest]
+    if gripper.least_width_m:
+        other["least"] = gripper.least_width_m
     return digest_of(
         {
             "version": VERSION,

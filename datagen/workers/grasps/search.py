@@ -105,6 +105,8 @@ def _free_poses(model: ObjectModel, gripper: Gripper, rng: np.random.Generator) 
         T, width_m = hand_poses(pairs, gripper.pad_size_m[1], rng)
         if gripper.linkage is not None:  # fingers that turn move their pads along the approach
             T[:, :3, 3] -= gripper.pad_depth_m(width_m)[:, None] * T[:, :3, 2]
+        is_wide = width_m >= gripper.least_width_m
+        T, width_m = T[is_wide], width_m[is_wide]
         # Few poses around a flat object are clear of the table: these are checked first.
         clear = _is_clear(model, gripper, T, np.minimum(width_m + AIR_M[0], gripper.max_opening_m))
         rows = np.concatenate([np.flatnonzero(clear)[:_CLEAR_POSES], np.flatnonzero(~clear)[:_OTHER_POSES]])

@@ -129,7 +129,7 @@ def _read(path: Path) -> tuple[OccupancyMap, float, list[_Support]]:
             problem = f"has no {name} cells"
             raise InputError(path, "image", problem, "Check negate, occupied_thresh and free_thresh")
     try:
-        values: dict[str, Any] = tomllib.loads(_toml(path).decode())
+        values: dict[str, Any] = tomllib.loads(_toml(path).decode("utf-8-sig"))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(place, "", f"is not TOML ({error})", _FIX) from None
     root = JsonNode(str(place), "$", values)

@@ -103,9 +103,7 @@ def _sdf(path: Path) -> Description:
                 if shape.find("material/diffuse") is not None:
                     rgb = tuple(_text(path, shape, "material/diffuse", 4, "1 1 1 1")[:3])
                 uri, image = (
-                    mesh_path(text.strip().replace("model://", "package://", 1), path)
-                    if (text := shape.findtext(tag, ""))
-                    else None
+                    mesh_path(text.strip(), path) if (text := shape.findtext(tag, "")) else None
                     for tag in ("geometry/mesh/uri", "material/pbr/metal/albedo_map")
                 )
                 scale = _text(path, shape, "geometry/mesh/scale", 3, "1 1 1")

@@ -16,6 +16,7 @@ from datagen.workers.robots.robot_file import RobotSource
 from datagen.workers.robots.urdf import FIX, Joint, Link, UrdfTree, rpy_rotation
 
 _REACH_TOLERANCE_M = 1e-6
+_HELD_OUTSIDE = 1e-3  # by which a joint may be held outside its range, as where it was rounded
 FEWEST, MOST = 4, 9  # coordinates
 # Speeds of joints for which the URDF has none.
 _SPEED_RADPS, _SPEED_MPS = 1.0, 0.2
@@ -36,6 +37,11 @@ class ArmChain:
         for name in (name for group in keys.arm.coupled for name in group):
             tree.joint(name)
         refuse_followers(source, tree, "arm.held", keys.arm.held)
+        for name, position in keys.arm.held.items():
+            low, high = tree.joint(name).lower, tree.joint(name).upper
+            if not low - _HELD_OUTSIDE <= position <= high + _HELD_OUTSIDE:
+                problem = f"is {position:g}, outside the range {low:g} to {high:g} of the joint"
+                raise source.wrong(f"arm.held.{name}", problem, "Correct it: radians, or metres")
         self._joints = [j for j in chain if j.kind != "fixed" and tree.driver(j)[0].name not in keys.arm.held]
         if not self._joints:
             raise source.wrong(

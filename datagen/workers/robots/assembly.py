@@ -90,7 +90,7 @@ def read_trees(source: RobotSource) -> tuple[UrdfTree, UrdfTree]:
     for name in keys.arm.ignore:
         source.refuse_unknown("arm.ignore", name, [*tree.links, *hand.links])
     for name in keys.arm.cuts_m:
-        source.refuse_unknown("arm.cuts_m", name, tree.links)
+        source.refuse_unknown("arm.cuts_m", name, [*tree.links, *hand.links])
     bare = [without_shapes(t, [name for name in keys.arm.ignore if name in t.links]) for t in (tree, hand)]
     return bare[0], bare[0] if hand is tree else bare[1]
 

@@ -12,6 +12,7 @@ from datagen.workers.kinematics.tree import Ints, KinematicTree, frame_poses
 
 Parts = tuple[F32, ...]  # convex parts, each (V, 3)
 _Y = np.array([0.0, 1.0, 0.0], np.float32)
+_GIVE_M = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +47,11 @@ class Gripper:
     palm_parts_m: Parts  # TCP frame
     finger_parts_m: tuple[Parts, Parts]  # TCP frame, fingers closed (opening 0)
     linkage: Linkage | None = None
+
+    @property
+    def least_width_m(self) -> float:
+        """Width of the thinnest object between the pads: these give, or lack their rubber in the URDF."""
+        return 0.0 if self.linkage is None else max(float(self.linkage.opening_m[0]) - _GIVE_M, 0.0)
 
     def body_poses(self, opening_m: F64) -> F64:
         """Poses (M, B, 4, 4) of the bodies in the TCP frame with the pads `opening_m` (M,) apart."""

@@ -36,9 +36,10 @@ def hand_of(source: RobotSource, tree: UrdfTree, palm: str) -> Hand:
     clusters, bodies = dict[str, Cluster](), dict[str, LinkBody]()
     for name in (palm, *(joint.child for joint in joints)):
         clusters[name] = cluster_of(tree, name, {joint.name for joint in joints}, held)
-        bodies[name] = body_of(name, clusters[name])
+        bodies[name] = body_of(name, clusters[name], cuts_m=source.keys.arm.cuts_m)
     if not bodies[palm].parts_m:
-        raise source.wrong("hand.palm", f"link {palm} has no collision shape", "Name the palm of the hand")
+        fix = "Name the palm of the hand, or give it <collision>, to which a <visual> does not count"
+        raise source.wrong("hand.palm", f"link {palm} has no collision shape", fix)
     carried = {joint.child: next(n for n, c in clusters.items() if joint.parent in c) for joint in joints}
     for joint in reversed(joints):  # joints that move no shape
         if not bodies[joint.child].parts_m and joint.child not in carried.values():
@@ -89,6 +90,10 @@ def _moving(source: RobotSource, tree: UrdfTree, palm: str) -> list[Joint]:
             )
             if moves and (not keys.fingers or driver in keys.fingers):
                 found.append(joint)
+    drivers = {tree.driver(joint)[0].name for joint in found}
+    for field, names in (("hand.fingers", keys.fingers), ("hand.range", keys.range)):
+        if other := next((name for name in names if name not in drivers), None):
+            raise source.wrong(field, f"joint {other} does not open the hand", f"Name one below {palm}")
     if not found:
         raise source.wrong("hand.palm", f"no joint moves below link {palm}", "Name the palm in hand.palm")
     return found

@@ -21,8 +21,12 @@ _PAD_M = 0.0015  # how far from the first contact the surface of a pad may lie
 _PARALLEL = 2 * np.tan(np.radians(5))  # faces that touch with a smaller slope between them are parallel
 _NEXT_M = 1e-6  # between lines on one face
 _MOVES = 0.5  # pads are where the fingers move apart by at least this share of the most
-_LEAST_OPENING_M, _CENTRED_M = 0.005, 0.004
+_LEAST_OPENING_M, _CENTRED_M, _APART_M = 0.005, 0.004, 0.002
 _HALVINGS = 14
+_OVERLAP = (
+    "its fingers overlap even when they are open",
+    "Leave out links with arm.ignore, give curved ones convex <collision> parts, or correct [hand.range]",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +104,7 @@ class HandMeasures:
     def gripper(self, name: str, pad_size_m: tuple[float, float] | None) -> Gripper:
         """The gripper. InputError where the hand cannot close on anything."""
         slides = self._slides()
-        if not (slides and self._is_given and pad_size_m):
+        if not (slides and self._is_given and pad_size_m and self._meets(pad_size_m)):
             q_closed, pads = self._pads()
             if pad_size_m is None:
                 x, z = (np.ptp(pads[0][:, k]) + cell for k, cell in zip((0, 2), self._cell_m, strict=True))
@@ -111,7 +115,7 @@ class HandMeasures:
                 self.T_palm_tcp = self.T_palm_tcp.copy()
                 self.T_palm_tcp[:3, 3] += self.T_palm_tcp[:3, :3] @ middle
                 pads = [np.column_stack([rows[:, :3] - middle, rows[:, 3:]]) for rows in pads]
-            if not slides:
+            if not (slides and self._meets(pad_size_m)):
                 return self._linkage(name, pad_size_m, q_closed, pads)
         from_palm, parts_m = inverse(self.T_palm_tcp), self._fingers.parts_m
         palm = tuple(_moved(part, from_palm) for part in parts_m[0])
@@ -134,6 +138,12 @@ class HandMeasures:
         even = tree.ratio[0] == tree.ratio[1] > _LEAST_OPENING_M / 2
         outwards = self.T_palm_tcp[:3, 1] * tree.ratio[0]
         return bool(even and np.allclose(travel * self.side[1:, None], outwards, atol=1e-6))
+
+    def _meets(self, pad_size_m: tuple[float, float]) -> bool:
+        """Whether the pads touch at the TCP while the joints are closed."""
+        half = np.array([pad_size_m[0], np.inf, pad_size_m[1]]) / 2
+        left, right = (self._nearest(0.0, side, -half, half) for side in (1, -1))
+        return not _APART_M < left - right < np.inf
 
     def _poses(self, q: float) -> F64:
         return inverse(self.T_palm_tcp) @ self._fingers.poses(q)
@@ -215,6 +225,8 @@ class HandMeasures:
                 q = (low + high) / 2
                 low, high = (q, high) if surfaces(q)[0].min() < 0 else (low, q)
             q, (gap, sides) = high, surfaces(high)
+            if gap.min() < 0:
+                raise self._wrong("hand", *_OVERLAP)
         if not np.isfinite(gap).any():
             fix = "Correct hand.tcp, hand.fingers or hand.range"
             raise self._wrong("hand", "its fingers do not meet: the hand cannot close on anything", fix)
@@ -247,16 +259,23 @@ class HandMeasures:
             # As far apart as a box of the pads' size fits between them.
             half = np.array([pad_size_m[0], np.inf, pad_size_m[1]]) / 2
             inner = [self._nearest(at, side, middle - half, middle + half) for side in (1, -1)]
+            if not np.isfinite(inner).all():
+                fix = "Name the joints of two opposite fingers in hand.fingers, or a smaller [hand.range]"
+                raise self._wrong("hand", "its fingers swing past one another before they are open", fix)
             opening[k] = max(inner[0] - inner[1], 0.0)
-            if np.isfinite(inner).all() and abs(sum(inner)) / 2 > _CENTRED_M:
-                fix = "Correct hand.tcp, or name joints of both fingers in hand.fingers"
+            if abs(sum(inner)) / 2 > _CENTRED_M:
+                fix = "Correct hand.tcp, or name the joints of two opposite fingers in hand.fingers"
                 raise self._wrong("hand", "its fingers do not close on the middle of its TCP", fix)
+        if not opening.any():
+            raise self._wrong("hand", *_OVERLAP)
         end = int(np.argmax(opening)) + 1
         falling = np.flatnonzero(np.diff(opening[:end]) <= 0)
         some = slice(int(falling[-1]) + 1 if len(falling) else 0, end)
         opening, depth, coordinate = opening[some], depth[some], coordinate[some]
         if len(opening) < 2 or opening[-1] < _LEAST_OPENING_M:
             problem = f"opens by {1000 * float(opening[-1]):.1f} mm: the hand cannot close on anything"
+            if opening[-1] >= _LEAST_OPENING_M:
+                problem = "its fingers do not part between the closed and the open position"
             raise self._wrong("hand", problem, "Give the closed and open positions in [hand.range]")
         closed, tree = self._poses(float(coordinate[0])), self._tree
         T_first = np.matmul(inverse(self.T_palm_tcp), tree.T_parent_joint)

@@ -29,15 +29,18 @@ from datagen.workers.robots.urdf import MOST, Shape
 # PhysX on a GPU accepts hulls of at most 64 corners, and coal is faster on fewer.
 MAX_CORNERS = 64
 # Part of the cache's keys: raise it when the same mesh gets other hulls.
-_VERSION = 1
+_VERSION = 2
 _CACHE = CacheFolder("link-hulls", most_files=1024)  # about 3 KB each
 _MAX_BYTES = 64 << 20
 _FIX = "Correct the file, or install its package again"
+_MISSING = "Correct the URDF; package://NAME is a folder NAME above it, or an installed package NAME"
+_FORMATS = (".obj", ".stl", ".dae", ".glb")
+_UNIT = re.compile(rb"""<unit\s[^>]*?\bmeter\s*=\s*["']\s*([0-9.eE+-]+)""")
 _BOX_BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
 _TAKEN_AT_ONCE = 4
 _PUSHES = 50
 _TOUCHING_M = 1e-6
-_MOST_FACES, _SHEET_M, _FLAT_M = 500_000, 0.0005, 5e-7
+_MOST_FACES, _SHEET_M, _FLAT_M, _LARGEST_M = 500_000, 0.0005, 5e-7, 20.0
 _RING = np.stack([f(2 * np.pi * (np.arange(16) + 0.5) / 16) for f in (np.cos, np.sin)], axis=1)
 # Faces, edges and corners of a cube.
 _DIRECTIONS = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -52,7 +55,7 @@ def shape_parts(shape: Shape, scale: float, cuts_m: tuple[float, ...] = ()) -> P
 
     Boxes are exact; cylinders and spheres lie within prisms that touch them. A mesh gives one hull, or one
     for each slab between the heights `cuts_m` along its z axis. Raises InputError naming the mesh that is
-    missing or broken, and a shape that is flat in single precision.
+    missing or broken, and a shape that is flat in single precision or larger than any robot.
     """
     if shape.size_m is not None:
         hulls = (_solid(shape.size_m),)
@@ -65,6 +68,10 @@ def shape_parts(shape: Shape, scale: float, cuts_m: tuple[float, ...] = ()) -> P
     if any(map(_is_flat, parts)):
         fix = "Correct it, or leave its link out with arm.ignore"
         raise InputError(shape.path, shape.where, "has no volume", fix)
+    size_m = max((float(np.ptp(part, axis=0).max()) for part in parts), default=0.0)
+    if size_m > _LARGEST_M:
+        fix = 'Give a mesh in millimetres scale="0.001 0.001 0.001", or leave its link out with arm.ignore'
+        raise InputError(shape.path, shape.where, f"is {size_m:,.0f} m large", fix)
     return parts
 
 
@@ -98,7 +105,7 @@ def mesh_hulls(path: Path, cuts_m: tuple[float, ...] = ()) -> tuple[F64, ...]:
 
     They are kept in the cache folder, because a reader of meshes takes a second to import.
     """
-    content = sha256(read_regular(path, _MAX_BYTES, _FIX)).hexdigest()
+    content = sha256(read_regular(path, _MAX_BYTES, _FIX if path.is_file() else _MISSING)).hexdigest()
     versions = _VERSION, version_of("scipy"), version_of("trimesh")
     key = sha256(repr((versions, content, path.suffix.lower(), cuts_m)).encode()).hexdigest()
     if (stored := _CACHE.load(key)) is not None:
@@ -115,7 +122,9 @@ def _hulls_of(path: Path, cuts_m: tuple[float, ...]) -> tuple[F64, ...]:
         return tuple(outer_hull(_slab(points, edges, low, high)) for low, high in itertools.pairwise(bounds))
     except (QhullError, ValueError):
         if cuts_m:
-            raise _wrong(path, f"has no body between two of the cuts {cuts_m} of arm.cuts_m") from None
+            z = f"it reaches from z = {points[:, 2].min():.4g} to {points[:, 2].max():.4g} in its units"
+            problem = f"has no body between two of the cuts {cuts_m}: {z}"
+            raise InputError(path, "", problem, "Correct arm.cuts_m, in metres") from None
     # A label or a marker: a sheet of no thickness gets one.
     thick = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2] * _SHEET_M
     try:
@@ -134,13 +143,13 @@ def read_points(path: Path) -> tuple[F64, npt.NDArray[np.int64]]:
         mesh = trimesh.load_mesh(io.BytesIO(data), file_type=path.suffix.lower(), process=False)
         points = np.asarray(mesh.vertices, np.float64) * _unit_m(data, path)
         edges = np.asarray(mesh.edges, np.int64)
-    except ImportError as error:
-        raise InputError(
-            path, "", f"needs {error.name or 'a reader'} to be read", how_to_get("robots")
-        ) from None
-    # Readers raise any of these for a broken mesh.
-    except Exception as error:
-        raise _wrong(path, f"is not a mesh ({type(error).__name__})") from error
+    except Exception as error:  # readers raise any for a broken mesh
+        kind = path.suffix.lower()
+        if isinstance(error, ImportError) and kind == ".dae":
+            missing = error.name or "a reader"
+            raise InputError(path, "", f"needs {missing} to be read", how_to_get("robots")) from None
+        fix = _FIX if kind in _FORMATS else "Convert it to OBJ, STL, DAE or GLB"
+        raise InputError(path, "", f"is not a mesh ({type(error).__name__})", fix) from error
     if len(edges) > 3 * _MOST_FACES:
         fix = f"Simplify it to {_MOST_FACES:,} faces, or leave its link out with arm.ignore"
         raise InputError(path, "", f"has {len(edges) // 3:,} faces", fix)
@@ -151,7 +160,7 @@ def read_points(path: Path) -> tuple[F64, npt.NDArray[np.int64]]:
 
 def _unit_m(data: bytes, path: Path) -> float:
     """Metres in a unit of the mesh: COLLADA states it, other formats are in metres."""
-    found = re.search(rb'<unit[^>]*meter="([0-9.eE+-]+)"', data) if path.suffix.lower() == ".dae" else None
+    found = _UNIT.search(data) if path.suffix.lower() == ".dae" else None
     return float(found[1]) if found else 1.0
 
 

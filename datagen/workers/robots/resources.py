@@ -39,12 +39,12 @@ def mesh_path(text: str, urdf: Path) -> Path:
     """The mesh that a URDF names; where it is not found, the path at which it was expected.
 
     The first part of `package://NAME/path` is a ROS package: a folder above the URDF of that name or that
-    holds it, or an installed Python package.
+    holds it, or an installed Python package; `model://NAME/path` of Gazebo is searched alike.
     """
-    plain = text.removeprefix("file://")
-    if not text.startswith("package://"):
-        return urdf.parent / plain
-    name, _, rest = text.removeprefix("package://").partition("/")
+    kind, _, plain = text.rpartition("://")
+    if kind not in ("package", "model"):
+        return urdf.parent / (plain if kind == "file" else text)
+    name, _, rest = plain.partition("/")
     near = [urdf.parent / name / rest]
     for folder in urdf.absolute().parents:
         near += [folder / rest] if folder.name == name else []

@@ -208,7 +208,7 @@ def read_robot(path: Path) -> RobotSource:
 def _read(path: Path, _stamp: int) -> RobotSource:
     data = read_regular(path, _MAX_BYTES, "Give a robot's TOML file: " + _FIX)
     try:
-        fields: dict[str, Any] = tomllib.loads(data.decode())
+        fields: dict[str, Any] = tomllib.loads(data.decode("utf-8-sig"))
         return RobotSource(path, RobotFile.model_validate(fields))
     except ValidationError as error:
         raise _first_of(error, path) from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -136,12 +137,14 @@ class UrdfTree:
             return -np.pi, np.pi
         if math.isinf(joint.lower):
             raise _wrong(self.path, f"joint {joint.name}", "has no limit")
-        if not joint.lower < joint.upper:
-            problem = f"its range {joint.lower} to {joint.upper} is empty"
+        lower, upper = joint.lower, joint.upper
+        if joint.kind == "revolute":
+            lower, upper = max(lower, -2 * np.pi), min(upper, 2 * np.pi)
+        if not lower < upper:
+            part = " within two turns each way" if joint.lower < joint.upper else ""
+            problem = f"its range {joint.lower} to {joint.upper} is empty{part}"
             raise _wrong(self.path, f"joint {joint.name}", problem)
-        if joint.kind == "prismatic":
-            return joint.lower, joint.upper
-        return max(joint.lower, -2 * np.pi), min(joint.upper, 2 * np.pi)
+        return lower, upper
 
 
 def read_urdf(path: Path) -> UrdfTree:
@@ -161,6 +164,10 @@ def read_urdf(path: Path) -> UrdfTree:
     reader = _Reader(path, root)
     links = {link.name: link for link in map(reader.link, root.findall("link"))}
     joints = {joint.name: joint for joint in map(reader.joint, root.findall("joint"))}
+    for kind in ("link", "joint"):
+        names = Counter(element.get("name") for element in root.findall(kind))
+        if repeated := next((name for name, count in names.items() if count > 1), None):
+            raise _wrong(path, f"{kind} {repeated}", f"is the name of {names[repeated]} {kind}s")
     for joint in joints.values():
         for end in (joint.parent, joint.child):
             if end not in links:
@@ -250,8 +257,8 @@ class _Reader:
             solid = element.find(f"geometry/{kind}")
             if solid is not None:
                 size_m = np.concatenate([self.numbers(solid, key, n, where, "") for key, n in keys])
-                if not (size_m > 0).all():
-                    raise _wrong(self.path, where, f"its {kind} has no volume")
+                if (size_m < 0).any():
+                    raise _wrong(self.path, where, f"its {kind} has a negative size")
                 return Shape(T, size_m, None, np.ones(3), self.path, where, rgb)
         mesh = element.find("geometry/mesh")
         if mesh is None:

@@ -201,6 +201,16 @@ def test_deeply_nested_configurations_are_refused(text: str, tmp_path: Path) -> 
         specify("heuristic", open_houses("builtin"), open_objects("builtin"), {}, config)
 
 
+def test_a_mark_at_the_beginning_is_no_part_of_a_configuration(tmp_path: Path) -> None:
+    config = tmp_path / "run.toml"
+    found = list[str]()
+    for encoding in ("utf-8", "utf-8-sig"):  # the latter as Notepad writes it
+        config.write_text("[candidates]\nper_scene = 7\n", encoding)
+        builtin = open_houses("builtin"), open_objects("builtin")
+        found.append(specify("heuristic", *builtin, {}, config).model_dump_json())
+    assert found[0] == found[1]
+
+
 def test_many_decimals_and_dots_in_text_are_no_deep_key(tmp_path: Path) -> None:
     (file := tmp_path / "a.toml").write_text(
         f'poses = [{"[0.25, -1.5], " * 300}]  # {"." * 500}\ntext = "{"a." * 500}"\n'

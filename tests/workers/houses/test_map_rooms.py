@@ -114,6 +114,11 @@ def test_each_cell_is_floor_wall_or_hidden_as_the_map_says(
     np.testing.assert_array_equal(found >= 0, floor[few])
 
 
+def test_a_mark_at_the_beginning_is_no_part_of_a_list_of_supports(tmp_path: Path) -> None:
+    house = load(tmp_path / "a", room_cells(), f"\ufeffoccupied_height_m = 2.4\n{TABLE}")
+    assert len(house.surfaces) == 1
+
+
 def test_supports_off_the_floor_are_counted_and_mostly_such_are_refused(tmp_path: Path) -> None:
     away = TABLE.replace("[2.5, 2.0]", "[12.5, 2.0]")
     narrow = TABLE.replace("[1.4, 0.8]", "[1.4, 0.2]")

@@ -14,6 +14,7 @@ pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run 
 from datagen import cli
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import TrialParams
+from datagen.workers.grasps.search import hand_poses_of
 from datagen.workers.robots import (
     open_robot,
     remember,
@@ -21,8 +22,10 @@ from datagen.workers.robots import (
     robot_limits,
     robot_source,
 )
+from datagen.workers.robots.assembly import assemble
 from datagen.workers.robots.urdf import read_urdf
 from tests.sim_extra import needs_robots
+from tests.workers.worlds import box_model
 
 # A 5-joint arm of plain solids on a box, with a hand of two fingers that pivot.
 LINKS = {
@@ -108,6 +111,13 @@ def test_everything_is_derived_from_a_file_of_five_lines(make: Made) -> None:
     assert len(robot.homes_rad) >= 4 and not any(robot.collides_itself(q) for q in robot.homes_rad)
 
 
+def test_a_mark_and_line_ends_of_windows_change_no_robot(make: Made) -> None:
+    plain, other = make(), make(folder="b")
+    for file in (Path(other), Path(other).with_name("robot.urdf")):
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
+    assert robot_limits(other) == robot_limits(plain)
+
+
 def test_pads_are_whole_faces_of_fingers_that_touch_with_an_edge(make: Made) -> None:
     # From 0.15 rad on, the fingers diverge: of 12 cm the outer half counts, which moves apart enough.
     gripper = open_robot(make(more="[hand.range]\nopen = [0.15, 0.6]\n"), None, 0.85).gripper
@@ -179,6 +189,32 @@ def test_links_with_a_visual_alone_are_named_and_refused_where_no_other_moves(
 
 
 @needs_robots
+def test_fingers_whose_carriages_overlap_are_refused_and_grip_with_their_tips(tmp_path: Path) -> None:
+    file = tmp_path / "baxter.toml"
+    urdf = "package:example-robot-data/robots/baxter_description/urdf/baxter.urdf"
+    text = f'urdf = "{urdf}"\n[arm]\nbase = "base"\ntip = "left_gripper_base_link"\n'
+    file.write_text(text)
+    with pytest.raises(InputError, match=r"baxter\.toml: hand: its fingers overlap .* with arm\.ignore"):
+        assemble(robot_source(str(file)), None)
+    tips = tmp_path / "tips.toml"
+    tips.write_text(text + 'ignore = ["l_gripper_l_finger", "l_gripper_r_finger"]\n')
+    linkage = assemble(robot_source(str(tips)), None).hand.gripper.linkage
+    assert linkage is not None  # boxes at 11.25 mm of 6.5 mm, that slide by 20.833 mm each
+    np.testing.assert_allclose(linkage.opening_m[[0, -1]], (0.016, 0.016 + 2 * 0.020833), atol=1e-5)
+
+
+@needs_robots
+def test_fingers_that_swing_past_one_another_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "alex.toml"
+    urdf = "package:example-robot-data/robots/alex_description/urdf/alex_sake_hands.urdf"
+    file.write_text(f'urdf = "{urdf}"\n[arm]\nbase = "Torso"\ntip = "LeftSakePalmLink"\n')
+    with pytest.raises(
+        InputError, match=r"alex\.toml: hand: its fingers swing past one another.*hand\.fingers"
+    ):
+        assemble(robot_source(str(file)), None)
+
+
+@needs_robots
 def test_an_arm_is_checked_against_its_deck() -> None:
     robot = open_robot("ur5", None, 0.4)
     names = [robot.link_names[a] + " " + robot.link_names[b] for a, b in robot.self_pairs]
@@ -197,6 +233,38 @@ HAND = "".join(
     f'<origin xyz="0.1 {y} 0"/><axis xyz="0 {side} 0"/><limit velocity="1" effort="10"/></joint>'
     for name, child, y, side in (("pan", "left", 0.006, 1), ("elbow", "right", -0.006, -1))
 )
+
+
+@pytest.mark.parametrize(
+    "tcp", ["", "pad_size_m = [0.02, 0.02]\ntcp.xyz_m = [0.1, 0, 0]\ntcp.approach = 'x'\n"]
+)
+def test_sliding_fingers_that_stand_apart_when_closed_open_by_what_lies_between_them(
+    make: Made, tcp: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hand = HAND.replace("0.1 0.006 0", "0.1 0.015 0").replace("0.1 -0.006 0", "0.1 -0.015 0")
+    ranges = "range = { pan = [0, 0.04], elbow = [0, 0.04] }\n"
+    more = f'[hand]\nurdf = "hand.urdf"\npalm = "palm"\n{ranges}{tcp}'
+    name = make(('tip = "palm"', 'tip = "wrist"'), more=more)
+    Path(name).with_name("hand.urdf").write_text(f"<robot name='h'>{hand}</robot>")
+    gripper = assemble(robot_source(name), None).hand.gripper  # fingers of 10 mm, their middles 30 mm apart
+    assert gripper.max_opening_m == pytest.approx(0.1)
+    assert gripper.linkage is not None and gripper.linkage.opening_m[0] == pytest.approx(0.02)
+    assert cli.run(["robot", name]) == 0
+    assert "palm and 2 sliding bodies" in capsys.readouterr().out
+
+
+def test_a_hand_grasps_nothing_thinner_than_what_lies_between_its_closed_pads(make: Made) -> None:
+    hand = HAND.replace("0.1 0.006 0", "0.1 0.035 0").replace("0.1 -0.006 0", "0.1 -0.035 0")
+    ranges = "range = { pan = [0, 0.04], elbow = [0, 0.04] }\n"
+    name = make(
+        ('tip = "palm"', 'tip = "wrist"'), more=f'[hand]\nurdf = "hand.urdf"\npalm = "palm"\n{ranges}'
+    )
+    Path(name).with_name("hand.urdf").write_text(f"<robot name='h'>{hand}</robot>")
+    gripper = assemble(robot_source(name), None).hand.gripper  # its pads stay 60 mm apart, and may give by 10
+    assert gripper.least_width_m == pytest.approx(0.05)
+    rng = np.random.default_rng(0)
+    thin, wide = (hand_poses_of(box_model("box", (side_m,) * 3), gripper, rng) for side_m in (0.025, 0.055))
+    assert len(thin.opening_m) == 0 and len(wide.opening_m) > 50
 
 
 def test_fingers_without_limits_and_with_names_of_the_arm_move_in_physics(make: Made) -> None:
@@ -263,8 +331,15 @@ def test_a_digest_depends_on_content_and_not_on_the_place(make: Made) -> None:
         ((ENDS, 'base = "palm"\ntip = "base"'), ("", ""), "", r"not below link palm"),
         (("", ""), ('type="continuous"', 'type="floating"'), "", r"joint pan: is floating"),
         (("", ""), (LIMIT.format(-1.5, 1.5), ""), "", r"tilt: has no limit"),
+        (("", ""), (LIMIT.format(-1.5, 1.5), LIMIT.format(7, 8)), "", r"range 7.0 to 8.0 is empty within"),
+        (("", ""), ('link name="left"', 'link name="upper"'), "", r"link upper: is the name of 2 links"),
+        (("", ""), ('joint name="roll"', 'joint name="pan"'), "", r"joint pan: is the name of 2 joints"),
+        (("", ""), ('box size="0.35 ', 'box size="0 '), "", r"upper collision: has no volume.*arm\.ignore"),
+        (("", ""), ('box size="0.35 ', 'box size="-0.35 '), "", r"collision: its box has a negative size"),
         (("", ""), ('multiplier="-1"', 'multiplier="0"'), "", r"hand: .*middle of its TCP"),
         (("", ""), ("", ""), "[hand.range]\nopen = [0.0, 0.01]\n", r"opens by [0-9.]+ mm: the hand"),
+        (("", ""), ("", ""), "[hand.range]\nopen = [0.6, 0.0]\n", r"hand: its fingers do not part between"),
+        (("", ""), ("0.12 0.01 0.02", "0.12 0.3 0.02"), "", r"fingers overlap even when they are open"),
         (("", ""), ("", ""), '[hand]\nfingers = ["gone"]\n', r"joint gone: is missing"),
         (("", ""), ("", ""), "[hand.range]\nopen = [0.0, 0.5]\ngone = [0.0, 0.1]\n", r"gone: is missing"),
         (('tip = "palm"', 'tip = "palm"\nignore = ["left", "right"]'), ("", ""), "", r"palm has a shape"),
@@ -285,6 +360,9 @@ def test_a_digest_depends_on_content_and_not_on_the_place(make: Made) -> None:
         (("", ""), ("", ""), '[hand]\npalm = "lower"\n', r"link lower: is not below link palm"),
         (("", ""), ("", ""), "[hand.range]\nfollow = [0.0, 0.1]\n", r"hand\.range: joint follow mimics open"),
         (("", ""), ("", ""), "[arm.held]\nfollow = 0.1\n", r"arm\.held: joint follow mimics open. Name open"),
+        (("", ""), ("", ""), "[arm.held]\nlift = 9.0\n", r"held\.lift: is 9, outside the range 0 to 0\.4"),
+        (("", ""), ("", ""), "[hand.range]\ntilt = [0.0, 0.1]\n", r"hand\.range: joint tilt does not open"),
+        (("", ""), ("", ""), '[hand]\nfingers = ["open", "roll"]\n', r"fingers: joint roll does not open"),
         (("", ""), ("", ""), "[arm.cuts_m]\nnope = [0.1]\n", r"arm\.cuts_m: link nope is not in the URDF"),
         (('urdf =', 'reach_m = 0.5\nurdf ='), ("", ""), "", r"reach_m: is 0\.5 m, and the URDF's arm has"),
     ],
@@ -320,7 +398,17 @@ def test_meshes_of_every_format_are_read_and_broken_ones_refused(make: Made, tmp
         robot = open_robot(path, None, 0.85)
         part, wanted = robot.link_parts_m[3][0], plain.link_parts_m[3][0]
         np.testing.assert_allclose(np.sort(part, axis=0), np.sort(wanted, axis=0), atol=1e-6)
+    path = make(urdf=(box, '<mesh filename="model://arm/upper.dae"/>'), folder="unit")  # as in Gazebo's files
+    (tmp_path / "unit/arm").mkdir()
+    mesh.apply_scale(100.0).export(tmp_path / "unit/arm/upper.dae")
+    text = (tmp_path / "unit/arm/upper.dae").read_text().replace("<up_axis>", "<unit meter='0.01'/><up_axis>")
+    (tmp_path / "unit/arm/upper.dae").write_text(text)
+    part = open_robot(path, None, 0.85).link_parts_m[3][0]
+    np.testing.assert_allclose(np.sort(part, axis=0), np.sort(plain.link_parts_m[3][0], axis=0), atol=1e-6)
     for name, content, said in (
+        ("package://arm/gone.stl", None, r"arm/gone.stl: cannot be read.*package://NAME is a folder"),
+        ("a.step", b"ISO", r"a.step: is not a mesh .*Convert it to OBJ, STL"),
+        ("in_mm.stl", trimesh.creation.box((350.0, 60.0, 60.0)).export(file_type="stl"), "is 350 m large"),
         ("gone.stl", None, "gone.stl: cannot be read"),
         ("bad.dae", b"<COLLADA>", r"bad.dae: (is not a mesh|needs)"),
         ("bad.glb", b"glTF" + bytes(40), "bad.glb: is not a mesh"),
@@ -337,11 +425,31 @@ def test_meshes_of_every_format_are_read_and_broken_ones_refused(make: Made, tmp
         robot_limits(path)
 
 
+def test_meshes_of_the_hand_are_cut_and_cuts_beside_a_mesh_are_named(make: Made) -> None:
+    import trimesh
+
+    for folder, height_m, parts in (("a", 0.01, 2), ("b", 0.05, 0)):
+        cuts = ('"palm"\n', f'"palm"\ncuts_m = {{ palm = [{height_m}] }}\n')
+        shape = '<mesh filename="palm.stl" scale="0.001 0.001 0.001"/>'
+        path = make(cuts, ('<box size="0.06 0.12 0.06"/>', shape), folder)
+        trimesh.creation.box((60.0, 120.0, 60.0)).export(Path(path).with_name("palm.stl"))
+        if parts:
+            palm = assemble(robot_source(path), None).hand.bodies[0]
+            assert sorted(float(np.ptp(part[:, 2])) for part in palm.parts_m) == pytest.approx([0.02, 0.04])
+            continue
+        with pytest.raises(
+            InputError, match=r"palm\.stl: .*\(50\.0,\): it reaches from z = -30 to 30 in its"
+        ):
+            assemble(robot_source(path), None)
+
+
 def test_a_missing_visual_mesh_and_a_link_without_length_do_not_block(make: Made) -> None:
     visual = '<visual><geometry><mesh filename="gone.dae"/></geometry></visual>'
     path = make(urdf=('<link name="upper">', f'<link name="upper">{visual}'))
     robot = open_robot(path, None, 0.85)
     assert [len(m.faces) > 0 for m in robot.link_meshes()] == [bool(p) for p in robot.link_parts_m]
+    placeholder = '<visual><geometry><box size="0 0 0"/></geometry></visual>'  # as in Sawyer's URDF
+    assert open_robot(make(urdf=('<link name="upper">', f'<link name="upper">{placeholder}')), None, 0.85)
     short = make(urdf=('"0.42 0 0"', '"0 0 0"'), folder="b")
     assert open_robot(short, None, 0.85).reach_m < robot.reach_m
 
