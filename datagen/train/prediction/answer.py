@@ -147,11 +147,6 @@ class Prediction:
         return float(np.mean(shares)) if shares else None
 
     @property
-    def expected(self) -> F64 | None:
-        """Success (N,) expected with the arrival error; None without one, and where no pose is best."""
-        return None if self.arrival is None else self.choice.chance
-
-    @property
     def level(self) -> Literal["good", "doubtful", "none"]:
         """Whether to drive there: "none" without a best pose, "doubtful" where `reasons` speak against it."""
         return "none" if self.best is None else "doubtful" if self.reasons else "good"
@@ -177,7 +172,7 @@ class Prediction:
 
     def doubts_about(self, row: int) -> tuple[tuple[str, str], ...]:
         """Codes and texts of what speaks against one base pose; how far it may be missed only of the best."""
-        score, expected = self.score[row], self.expected
+        score, expected = self.score[row], self.choice.expected
         miss_m = self.choice.miss_m if row == self.best else None
         is_unseen = self.cells.state[row] == STATES.index(UNSEEN)
         is_tight = expected is None and miss_m is not None and miss_m < _LEAST_MISS_M

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from datagen.schemas.fields import facing_rad
 from datagen.schemas.specification import CandidateParams
-from datagen.train.arrivals import Arrival, expected_success, stands, tolerance_m
+from datagen.train.arrivals import Arrival, expected_success, normal_arrival, stands, tolerance_m
 from datagen.train.inputs import F32, F64, I64, Bools
 from datagen.train.prediction.floor_ways import CELL_M, WAYS, counted, draw_map, map_corners, ways_to
 from datagen.train.prediction.footprints import Footprint
@@ -31,6 +31,7 @@ _GAP_CELLS = 4  # gaps up to twice as wide are closed
 _BOARD_M = 0.08
 _AROUND_M = 3.0  # from the grid's middle; farther points are ignored
 _THIN_M = 0.01  # points of obstacles are counted in cells of this side
+_STOPS = normal_arrival(0.02)  # around its goal, a robot that arrives well
 
 
 @dataclass(frozen=True)
@@ -193,7 +194,7 @@ class Choice:
 
     best: int | None
     nominal: int | None  # the row with the best score
-    chance: F64 | None  # (N,) success expected where the robot stops; None where none is best
+    expected: F64 | None  # (N,) success expected with the arrival error; None without one
     miss_m: float | None  # distance by which the robot may miss the best while scores stay good
     can_stand: Bools  # (N,) whether a pose may be chosen
     ranked: I64  # (K,) rows of those with a good score, best first
@@ -205,11 +206,13 @@ def choose(
     allowed: Sequence[str],
     threshold: float,
     arrival: Arrival | None,
+    alike: float = 0.0,
 ) -> Choice:
     """The best of the cells in an `allowed` state; with an arrival error by the mean score on arrival.
 
     A robot that arrives where a base is in another state fails. Scores from `threshold` on are good: where no
-    pose has one, none is best. Without a threshold (nan) there is no `miss_m`.
+    pose has one, none is best. Without a threshold (nan) there is no `miss_m`. Of scores that are `alike`, by
+    how much they differ from the best, the one with the most room for a robot that stops well is taken.
     """
     can_stand = np.isin(cells.state, [STATES.index(name) for name in allowed])
     rows = np.flatnonzero(can_stand)
@@ -220,10 +223,15 @@ def choose(
         return Choice(None, nominal, None, None, can_stand, rows[:0])
     side = round(float(np.sqrt(len(score))))
     step_m = float(np.ptp(cells.offset_m[:, 0]) / (side - 1))
-    value = stands(score, can_stand).reshape(side, side)
-    chance = score if arrival is None else expected_success(value, step_m, arrival).ravel()
-    good = rows[~(score[rows] < threshold)]
-    ranked = good[np.argsort(-chance[good], kind="stable")]
-    best = int(ranked[0])
+    value, is_good = stands(score, can_stand).reshape(side, side), can_stand & ~(score < threshold)
+    good = np.flatnonzero(is_good)
+    if arrival is None:
+        expected, best = None, good[score[good] >= score[nominal] - alike]
+        room = expected_success(is_good.astype(np.float64).reshape(side, side), step_m, _STOPS).ravel()
+        best = int(best[np.lexsort([-score[best], -room[best]])[0]])
+    else:
+        expected = expected_success(value, step_m, arrival).ravel()
+        best = int(rows[np.argmax(expected[rows])])
+    ranked = good[np.argsort(-(score if expected is None else expected)[good], kind="stable")]
     miss_m = None if np.isnan(threshold) else tolerance_m(value, step_m, divmod(best, side), threshold)
-    return Choice(best, nominal, chance, miss_m, can_stand, ranked)
+    return Choice(best, nominal, expected, miss_m, can_stand, ranked)

@@ -63,11 +63,13 @@ def write_goal(file: Path, p: Prediction, frame_id: str, stamp_ns: int) -> bool:
 
 def alternatives(p: Prediction) -> list[int]:
     """Rows of up to five base poses to try in turn after the best, those on floor that was seen first."""
-    chance = p.choice.chance
-    assert p.best is not None and chance is not None
+    assert p.best is not None
+    chance = p.score if p.choice.expected is None else p.choice.expected
     rows = np.array([p.best, *p.choice.ranked[p.choice.ranked != p.best]])
     last = (p.cells.state[rows] == STATES.index(UNSEEN)) & (rows != p.best)
-    return rows[in_turn(chance[rows], p.base_xy_m[rows], 1 + _MOST, last)][1:].tolist()
+    chance = chance[rows]
+    chance[0] = chance.max()  # the best comes first, and has about the highest
+    return rows[in_turn(chance, p.base_xy_m[rows], 1 + _MOST, last)][1:].tolist()
 
 
 def in_turn(chance: F64, base_xy_m: F64, most: int, last: Bools | None = None) -> list[int]:

@@ -135,8 +135,8 @@ def draw_plan(axes: Axes, prediction: Prediction) -> None:
         arrow = {"arrowstyle": "-|>", "color": BEST.colour, "lw": 3, "mutation_scale": 22}
         axes.annotate("", tuple(tip), tuple(xy), arrowprops=arrow, zorder=8)
         legend += axes.plot(*xy, label="best", zorder=9, **gold)
-    nominal = prediction.choice.nominal
-    if prediction.expected is not None and nominal not in (None, prediction.best):
+    nominal, expected = prediction.choice.nominal, prediction.choice.expected
+    if expected is not None and nominal not in (None, prediction.best):
         white: dict[str, Any] = gold | {"marker": "D", "color": "white"}
         legend += axes.plot(*prediction.base_xy_m[nominal], label="best score", zorder=9, **white)
     axes.set(xlim=(centre[0] - half_m, centre[0] + half_m), ylim=(centre[1] - half_m, centre[1] + half_m))

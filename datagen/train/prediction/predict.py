@@ -13,7 +13,7 @@ import numpy as np
 from datagen.released import RELEASED, released_program
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import CandidateParams
-from datagen.train.arrivals import Arrival, normal_arrival
+from datagen.train.arrivals import Arrival
 from datagen.train.headings import refuse_other_heading, trained_side_deg
 from datagen.train.inputs import F64, Array, Batch, CandidateInputs, Clouds, RobotInputs
 from datagen.train.prediction.answer import CROP, Prediction
@@ -41,10 +41,9 @@ if TYPE_CHECKING:
     from datagen.train.training.checkpoints import CheckpointHead
 
 _SLACK_M = 0.01  # how far a robot's sizes may be beyond those of the training data
-# Base poses along each side of the grid: 0.05 m apart, as maps' cells are. A coarser grid has none in narrow
-# gaps between furniture.
-_SIDE = 41
-_STOPS_M = 0.02  # from its goal, even a robot that arrives well
+# Base poses along each side of the grid, 0.04 m apart: a coarser grid has none in narrow gaps of furniture.
+_SIDE = 51
+_ALIKE = 0.05  # scores of a model that differ by this or less
 
 
 def load_scorer(checkpoint: str | Path | None = None) -> ModelScorer | ProgramScorer:
@@ -112,9 +111,8 @@ def predict(
     or the floor in sight it gives the pose of a frame that has none. The target is given by masks, by one
     click or a box in the first frame, or by a cloud's own marks; `target_center_m` (3,), world, replaces the
     estimated centre. With an `arrival` error the best is the cell with the highest expected success; without
-    one a model's best is that of a robot that stops well, so that of equal scores the one with room is taken.
-    A map of the floor that is `known` is in the frame of the poses of the frames. InputError where arguments
-    are missing or invalid.
+    one, of a model's scores within 0.05 of the highest, the cell with the most room. A map of the floor that
+    is `known` is in the frame of the poses of the frames. InputError where arguments are missing or invalid.
     """
     if is_model := isinstance(scorer, (ModelScorer, ProgramScorer)):
         side_deg = 0.0 - math.degrees(robot.yaw_rad)
@@ -141,8 +139,7 @@ def predict(
     cells = observe_cells(seen, centre, robot, params, yaw_rad, known)
     score = scored(scorer, _batch(cloud, target, robot, cells))
     allowed = (CLEAR, UNSEEN) if allow_unseen else (CLEAR,)
-    stops = normal_arrival(_STOPS_M) if arrival is None and is_model else arrival
-    choice = choose(score, cells, allowed, scorer.threshold, stops)
+    choice = choose(score, cells, allowed, scorer.threshold, arrival, _ALIKE if is_model else 0.0)
     read = (note for frame in frames if frame.image is not None for note in frame.image.notes)
     notes = (*read, *_notes(grounds, filled, cloud))
     sizes = (("untrained_size", note) for note in robot_notes(scorer, robot))

