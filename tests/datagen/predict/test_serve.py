@@ -163,7 +163,7 @@ def test_the_service_goes_on_after_a_worker_was_killed(seen: Seen) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ((), "--base-height: is missing"),
+        ((), "error: --base-height: is missing"),
         (("--robot", "fetchh"), "fetchh: is unknown"),
         (("--base-height", "-1", "--reach", "0.9"), "--base-height"),
         (("--robot", "fetch", "--footprint", "x"), "footprint"),
