@@ -137,7 +137,8 @@ class PredictOptions:
             reach and base.
         base_height: Height of the arm's mount above the floor (m).
         reach: Reach of the arm from its mount (m).
-        demo: Predict on the frame that ships with the package; writes demo.png and demo.html.
+        demo: Predict on the frame that ships with the package; writes demo.png and, with the extra train,
+            demo.html.
         export: New folder for the frame of --demo or --bag; of --bag also where no target is given yet.
         frame: Frame as a folder, .npz, .ply or .pcd; several with poses are fused.
         bag: Recording of ROS 2 in place of frames: .mcap, .db3 or a folder of rosbag2, with tf.
