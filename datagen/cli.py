@@ -13,6 +13,7 @@ import sys
 import threading
 from difflib import get_close_matches
 from inspect import getdoc
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cyclopts import App, Group, Parameter
@@ -185,7 +186,7 @@ def run(arguments: Sequence[str]) -> int:
     verb = next(iter(arguments), "")
     allow(arguments)
     try:
-        code = _call(build_app(verb), [refuse_not_utf8(word) for word in arguments])
+        code = _call(build_app(verb), [_expand_home(refuse_not_utf8(word)) for word in arguments])
         sys.stdout.flush()
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
@@ -204,6 +205,11 @@ def run(arguments: Sequence[str]) -> int:
             sys.stderr.write(f"error: {one_line(line)}\n")
         return EXIT_BAD_INPUT
     return code
+
+
+def _expand_home(word: str) -> str:
+    """A word with its `~/` expanded, which shells leave as it is in `--out=~/FILE`."""
+    return re.sub("^(--[^=]+=)?~(?=/)", lambda found: f"{found[1] or ''}{Path.home()}", word)
 
 
 def _call(app: App, words: Sequence[str]) -> int:

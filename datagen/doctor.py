@@ -175,19 +175,19 @@ def _extra(name: str) -> str:
     return EXTRAS[name].gives
 
 
-def as_table(findings: list[Finding]) -> Table:
-    """A table with one row per finding; the fix is below it."""
-    table = Table(box=None, pad_edge=False, show_header=False)
-    table.add_column(no_wrap=True)
-    table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
+def print_findings(findings: list[Finding], console: Console) -> None:
+    """Print each finding, and its fix below it in one line, whose command can be copied."""
+    widest = max(len(each.name) for each in findings)
     for each in findings:
+        table = Table(box=None, pad_edge=False, show_header=False)
+        table.add_column(no_wrap=True, width=4)
+        table.add_column(no_wrap=True, width=widest)
+        table.add_column(overflow="fold")
         # Text, because brackets in paths and messages are not markup.
-        detail = Text(each.detail)
+        table.add_row(Text(each.status, style=_COLOURS[each.status]), each.name, Text(each.detail))
+        console.print(table)
         if each.fix:
-            detail.append(f"\n-> {each.fix}", style="cyan")
-        table.add_row(Text(each.status, style=_COLOURS[each.status]), each.name, detail)
-    return table
+            console.print(Text(f"  -> {each.fix}", style="cyan"), soft_wrap=True)
 
 
 def doctor(*, json: AsJson = False) -> int:
@@ -201,7 +201,7 @@ def doctor(*, json: AsJson = False) -> int:
         print_json({"ok": not failures, "checks": [asdict(each) for each in findings]})
     else:
         console = Console(highlight=False)
-        console.print(as_table(findings))
+        print_findings(findings, console)
         warnings = sum(each.status == "warn" for each in findings)
         verdict = "labels can be made here" if not failures else "labels cannot be made here yet"
         console.print(f"\n{verdict}: {failures} failed, {warnings} warned")

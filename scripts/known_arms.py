@@ -14,7 +14,7 @@ from datagen.train.hands.sizes import measured_hand
 from datagen.workers.motion.arm_links import RADIUS, TREE
 from datagen.workers.motion.measured_reach import link_spheres, measured_arm, reaches_of
 from datagen.workers.motion.pose_reach import KNOWN_ARMS, PoseReach
-from datagen.workers.robots import ROBOTS, gripper_of, robot_digest
+from datagen.workers.robots import ROBOTS, gripper_of, robot_digest, robot_limits
 
 
 def known_arms() -> dict[str, Any]:
@@ -27,6 +27,9 @@ def known_arms() -> dict[str, Any]:
         found[f"{name}/digest"] = np.array(robot_digest(name) or "")
         found[f"{name}/hand"] = measured_hand(gripper_of(name))
         found[f"{name}/reach_m"] = reaches_m
+        if (limits := robot_limits(name)).base_height_m and limits.footprint_m:
+            found[f"{name}/base_m"] = np.array([limits.base_height_m[0], limits.base_radius_m])
+            found[f"{name}/footprint_m"] = np.array(limits.footprint_m)
         found[f"{name}/size"] = np.array([size_row(arm) for arm in arms])
         found[f"{name}/code"] = arms[0].code
         tree, radius_m = link_spheres(name)

@@ -44,6 +44,8 @@ _UNSET = Parameter(show_default=False)  # an empty list says nothing
 _LARGEST_M = 10.0
 # Written by --demo in the working folder, unless --out or --html is given.
 DEMO_PICTURE, DEMO_PAGE = Path("demo.png"), Path("demo.html")
+# Options of --demo that decide its answer, for the command that repeats it.
+_KEPT = ("robot", "robot_camera_height", "footprint", "allow_unseen", "keep_out", "arrival")
 
 
 def print_prediction(
@@ -54,8 +56,7 @@ def print_prediction(
     demo: bool = False,
     export: str | Path | None = None,
     goal: str | Path | None = None,
-    robot: str | None = None,
-    **_: Any,
+    **rest: Any,
 ) -> int:
     """Print the best base pose; the exit code is 1 where no clear one has a good score."""
     from datagen.train.prediction.prediction_report import document, report_rows
@@ -72,11 +73,22 @@ def print_prediction(
         print_rows(f"base poses by {prediction.scorer}", [*report_rows(prediction), *written])
         if demo:
             place, own = sample_frame() if export is None else Path(export), prediction.robot
-            words = ["datagen", "predict", "--frame", str(place), "--map", str(place / MAP)]
-            words += ["--base-height", f"{own.base_height_m:g}", "--reach", f"{own.arm_reach_m:g}"]
-            words += ["--out", "answer.png", *([] if robot is None else ["--robot", robot])]
+            sizes = {"base_height": f"{own.base_height_m:g}", "reach": f"{own.arm_reach_m:g}"}
+            options = {"frame": place, "map": rest["map"] or [place / MAP], **sizes, "out": "answer.png"}
+            words = ["datagen", "predict", *([] if rest["checkpoint"] is None else [str(rest["checkpoint"])])]
+            words += _words(options | {name: rest[name] for name in _KEPT})
             print_lines(f"again: {shlex.join(words)}")  # a table would break the line
     return 0 if prediction.best is not None else 1
+
+
+def _words(options: dict[str, Any]) -> list[str]:
+    """Options as words of a command line."""
+    words = list[str]()
+    for name, value in options.items():
+        for each in value if isinstance(value, Sequence) and not isinstance(value, str) else [value]:
+            if each is not None and each is not False:
+                words += [f"--{name.replace('_', '-')}", *([] if each is True else [str(each)])]
+    return words
 
 
 def _demo_page() -> Path | None:
@@ -116,7 +128,8 @@ class PredictOptions:
             reach and base.
         base_height: Height of the arm's mount above the floor (m).
         reach: Reach of the arm from its mount (m).
-        demo: Predict on the frame that ships with the package; writes demo.png and demo.html.
+        demo: Predict on the frame that ships with the package; writes demo.png and, with the extra train,
+            demo.html.
         export: New folder for the frame of --demo or --bag; of --bag also where no target is given yet.
         frame: Frame as a folder, .npz, .ply or .pcd; several with poses are fused.
         bag: Recording of ROS 2 in place of frames: .mcap, .db3 or a folder of rosbag2, with tf.
@@ -351,7 +364,7 @@ def refuse_robot(given: PredictOptions) -> None:
 def _required(value: T | None, option: str) -> T:
     if value is None:
         fix = "Name a frame, or a recording with --bag" if option == "--frame" else "Give it in metres"
-        raise InputError("datagen predict", option, "is missing", fix)
+        raise InputError(option, "", "is missing", fix)
     return value
 
 

@@ -44,6 +44,9 @@ def whole_file(
                 file.flush()
                 os.fsync(file.fileno())
         os.replace(draft, path)
+    except OSError as error:
+        error.filename = error.filename or str(path)  # a full disk names no file
+        raise
     finally:
         with suppress(OSError):
             draft.unlink(missing_ok=True)

@@ -46,12 +46,13 @@ def entry(registry: Mapping[str, str], name: str, option: str) -> Any:
     except ImportError as error:
         if name not in registry and error.name == place:
             raise InputError(option, name, "is unknown", choices(registry, name)) from None
-        others = f"choose another one: {', '.join(sorted(set(registry) - {name}))}"
+        others = ", ".join(sorted(set(registry) - {name}))
+        another = f". Or choose another one: {others}" if others else ""
         if missing := missing_library(error):
             problem = f"needs {missing.place}, which is not installed"
-            raise InputError(option, name, problem, f"{missing.fix}. Or {others}") from error
-        fix = f"Run `datagen doctor`, or {others}"
-        raise InputError(option, name, f"cannot be imported here: {error}", fix) from error
+            raise InputError(option, name, problem, missing.fix + another) from error
+        problem = f"cannot be imported here: {error}"
+        raise InputError(option, name, problem, f"Run `datagen doctor`{another}") from error
     if not hasattr(module, attribute):
         raise InputError(option, name, f"{place} has no {attribute}", "Name one of its attributes")
     return getattr(module, attribute)

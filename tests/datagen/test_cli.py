@@ -236,3 +236,18 @@ def test_a_job_says_how_many_labels_it_made_and_how_many_the_store_has(
     assert wanted in shown
     assert cli.run(["status", str(tmp_path / "run")]) == 0
     assert "run run" not in capsys.readouterr().out.replace(str(tmp_path) + "/", "")
+
+
+def test_the_home_folder_is_found_where_a_shell_leaves_its_sign(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    home, work = tmp_path / "home", tmp_path / "work"
+    for folder in (home, work):
+        folder.mkdir()
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.chdir(work)
+    words = ["predict", "--demo", "--export=~/frame", "--out=~/answer.png", "--html", "~/answer.html"]
+    assert cli.run(words) == 0
+    assert f"{home}/frame" in capsys.readouterr().out
+    assert {each.name for each in home.iterdir()} >= {"frame", "answer.png", "answer.html"}
+    assert not list(work.iterdir())  # no folder named ~

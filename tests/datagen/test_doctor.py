@@ -106,9 +106,9 @@ def test_engines_work_where_the_tests_run_and_json_names_every_check(
         assert check["detail" if check["status"] == "ok" else "fix"]
 
 
-def test_brackets_in_a_message_are_no_markup() -> None:
-    console = Console(width=100)
+def test_brackets_in_a_message_are_no_markup_and_a_narrow_terminal_breaks_no_command() -> None:
+    console, fix = Console(width=40), "pip install '/a/folder/whose name/is/long/datagen[fast]'"
     with console.capture() as captured:
-        console.print(doctor.as_table([Finding("x", "fail", "[red]no[/blue] [/]", "use [fast]")]))
+        doctor.print_findings([Finding("x", "fail", "[red]no[/blue] [/]", fix)], console)
     assert "[red]no[/blue] [/]" in captured.get()
-    assert "use [fast]" in captured.get()
+    assert f"-> {fix}\n" in captured.get()

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from datagen import cli
+from datagen.workers.robots import ROBOTS
 from tests.linked_environments import install_wheel, link_libraries, own_files, wheel
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG, OPEN_TOPS, PER_SCENE, make_small_run, submit_arguments
@@ -150,6 +151,19 @@ def test_labels_are_made_and_shown_without_ray_and_torch(wheel: Path, tmp_path: 
     for extra, done in (("cluster", no_cluster), ("sim", no_sim), ("pybullet", no_settler)):
         labels.assert_lacks(extra, done)
     assert not other.exists()
+
+
+def test_the_released_model_answers_for_every_registered_robot_without_its_files(
+    wheel: Path, tmp_path: Path
+) -> None:
+    predict, names = Installed(wheel, tmp_path, "predict"), sorted(ROBOTS)
+    (tmp_path / "own.toml").write_text('urdf = "own.urdf"\n[arm]\nbase = "base"\ntip = "tool"\n')
+    demos = [["predict", "--demo", "--robot", name, "--json"] for name in names]
+    *answers, no_sim = predict.run(*demos, ["predict", "--demo", "--robot", "own.toml"])
+    for name, done in zip(names, answers, strict=True):
+        assert done.code == 0, (name, done.err)
+    predict.assert_lacks("sim", no_sim)
+    assert no_sim.err.rstrip().endswith("[sim]'")  # no other robot is offered in place of a file
 
 
 def test_models_train_and_predict_without_simulators(wheel: Path, tmp_path: Path) -> None:

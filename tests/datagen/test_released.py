@@ -113,6 +113,19 @@ def test_the_demonstration_is_also_of_other_robots(
     assert json_of(capsys, words)["candidates"] == answer["candidates"]
 
 
+def test_the_command_of_the_demonstration_keeps_the_options_that_decide_its_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_untrained(tmp_path / "own.ckpt", MODEL)
+    given = ["predict", "own.ckpt", "--demo", "--allow-unseen", "--footprint", "0.4", "--arrival", "nav2"]
+    answer = json_of(capsys, given)
+    cli.run(given)
+    words = shlex.split(capsys.readouterr().out.split("again: ")[1])[1:]
+    again = json_of(capsys, words)
+    assert again["scorer"] == answer["scorer"] and again["candidates"] == answer["candidates"]
+
+
 def test_a_frame_without_a_checkpoint_is_scored_by_the_released_model(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

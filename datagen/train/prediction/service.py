@@ -14,6 +14,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from fastapi import Depends, FastAPI, HTTPException, Query, Request
+from pydantic import BaseModel, Field
 
 from datagen import __version__
 from datagen.schemas.errors import InputError
@@ -44,6 +45,18 @@ class Sent(NamedTuple):
         """Its click and box, as `predict` takes them."""
         both = {"click": self.click, "box": self.box}
         return {name: None if given is None else tuple(given) for name, given in both.items()}
+
+
+class Asked(BaseModel, extra="forbid"):
+    """Options of a request; a misspelt one is refused."""
+
+    session: str | None = Field(None, pattern=r"^[\w.-]{1,64}$")
+    click: str | None = Field(None, pattern=r"^[0-9]{1,6},[0-9]{1,6}$")
+    box: str | None = Field(None, pattern=r"^[0-9]{1,6}(,[0-9]{1,6}){3}$")
+    arrival: str | None = Field(None, max_length=60, pattern=r"^(nav2$|normal:|disc:)")
+    allow_unseen: bool = False
+    camera_height: float | None = Field(None, gt=0, le=10)
+    candidates: bool = False
 
 
 class Sessions(OrderedDict[str, list[Sent]]):
@@ -115,14 +128,7 @@ def make_app(workers: WorkerProcesses, model: str, token: str | None) -> FastAPI
 
     @app.post("/base")
     async def base(  # pyright: ignore[reportUnusedFunction]
-        request: Request,
-        session: Annotated[str | None, Query(pattern=r"^[\w.-]{1,64}$")] = None,
-        click: Annotated[str | None, Query(pattern=r"^[0-9]{1,6},[0-9]{1,6}$")] = None,
-        box: Annotated[str | None, Query(pattern=r"^[0-9]{1,6}(,[0-9]{1,6}){3}$")] = None,
-        arrival: Annotated[str | None, Query(max_length=60, pattern=r"^(nav2$|normal:|disc:)")] = None,
-        allow_unseen: bool = False,
-        camera_height: Annotated[float | None, Query(gt=0, le=10)] = None,
-        candidates: bool = False,
+        request: Request, asked: Annotated[Asked, Query()]
     ) -> dict[str, Any]:
         """The base pose for the target in the frame of the body, an .npz, fused with those of its session.
 
@@ -133,12 +139,10 @@ def make_app(workers: WorkerProcesses, model: str, token: str | None) -> FastAPI
             data += part
             if len(data) > MOST_BYTES:
                 raise HTTPException(413, f"the body has more than {MOST_BYTES >> 20} MiB")
-        options = {
-            "arrival": arrival,
-            "allow_unseen": allow_unseen,
-            "camera_height": camera_height,
-        }
-        at, sides = (None if text is None else [*map(int, text.split(","))] for text in (click, box))
+        session, options = asked.session, asked.model_dump(exclude={"session", "click", "box", "candidates"})
+        at, sides = (
+            None if text is None else [*map(int, text.split(","))] for text in (asked.click, asked.box)
+        )
         frames = [Sent(bytes(data), at, sides), *sessions.get(session or "", ())][:MOST_FRAMES]
         try:
             found = await workers.call(frames, options)
@@ -146,7 +150,7 @@ def make_app(workers: WorkerProcesses, model: str, token: str | None) -> FastAPI
             raise HTTPException(422, re.sub(rf"\S*/{_BODY}", "the body", str(error))) from None
         if session is not None:  # not before: a frame that cannot be read would spoil the session
             sessions.add(session, frames[0])
-        return found if candidates else {key: found[key] for key in found if key != "candidates"}
+        return found if asked.candidates else {key: found[key] for key in found if key != "candidates"}
 
     @app.delete("/sessions/{name}")
     async def forget(name: str) -> dict[str, bool]:  # pyright: ignore[reportUnusedFunction]

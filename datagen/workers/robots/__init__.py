@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from datagen.schemas.errors import InputError, choices
+from datagen.workers.motion.pose_reach import known_arm
 from datagen.workers.registry import entry
 from datagen.workers.robots.robot_file import RobotSource, read_robot
 
@@ -55,7 +56,8 @@ class RobotLimits:
 def robot_limits(name: str) -> RobotLimits:
     """The ranges of a robot. Raises InputError as `open_robot` does.
 
-    They need no URDF where the file states the reach, and the height and outline of a base.
+    They need no URDF where the file states the reach, and the height and outline of a base, nor for a robot
+    of the registry.
     """
     source = robot_source(name)
     keys, base = source.keys, source.keys.base
@@ -65,9 +67,16 @@ def robot_limits(name: str) -> RobotLimits:
     if base.pedestal and reach_m is not None:
         height_m = radius_m = outline = None
     elif reach_m is None or height_m is None or radius_m is None:
-        robot = _built(source, None)
-        reach_m = reach_m or math.ceil(1000 * robot.reach_m) / 1000
-        height_m, radius_m, outline = robot.base.height_m, robot.base.radius_m, robot.base.footprint_m
+        try:
+            robot = _built(source, None)
+        except InputError:  # its URDF, or what reads it, is not installed
+            if not (known := known_arm(name)):
+                raise
+            reach_m, (height_m, radius_m) = float(known["reach_m"][0]), known["base_m"].tolist()
+            outline = tuple((x, y) for x, y in known["footprint_m"].tolist())
+        else:
+            reach_m = reach_m or math.ceil(1000 * robot.reach_m) / 1000
+            height_m, radius_m, outline = robot.base.height_m, robot.base.radius_m, robot.base.footprint_m
     heights_m = None if height_m is None else (height_m, height_m)
     return RobotLimits((reach_m, reach_m), heights_m, radius_m, outline, base.presents, base.yaw_rad)
 

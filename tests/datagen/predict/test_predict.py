@@ -20,6 +20,7 @@ from datagen import cli, released
 from tests.datagen.predict.frames import arguments, frame_with
 from tests.refusals import refused
 from tests.sim_extra import needs_robots
+from tests.small_disk import small_disk
 from tests.small_runs import json_of
 from tests.train.prediction.checkpoints import document_of, stored_with, write_untrained
 from tests.train.prediction.seen_scenes import MODEL
@@ -257,3 +258,12 @@ def test_a_cloud_of_equal_points(
     given = arguments(made, "--frame", str(tmp_path / "equal.ply"), "--gravity", "0,1,0")
     assert cli.run(given) in (0, 1, 2)
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_picture_that_a_full_disk_does_not_hold_is_named(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with small_disk(tmp_path / "disk", "64k") as disk:
+        picture = disk / "answer.png"
+        refused(arguments(made, "--out", str(picture)), capsys, f"{picture}: No space left on device")
+        assert not list(disk.iterdir())

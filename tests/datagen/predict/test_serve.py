@@ -114,6 +114,7 @@ def test_the_latest_frame_that_marks_a_target_decides(client: TestClient, seen: 
         (None, {"arrival": "/etc/passwd"}, 422, "arrival"),
         (None, {"arrival": "normal:x"}, 422, "--arrival"),
         (None, {"camera_height": "-1"}, 422, "camera_height"),
+        (None, {"allow_unsen": "true"}, 422, "allow_unsen"),
     ],
 )
 def test_hostile_requests_get_a_reason(
@@ -162,7 +163,7 @@ def test_the_service_goes_on_after_a_worker_was_killed(seen: Seen) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ((), "--base-height: is missing"),
+        ((), "error: --base-height: is missing"),
         (("--robot", "fetchh"), "fetchh: is unknown"),
         (("--base-height", "-1", "--reach", "0.9"), "--base-height"),
         (("--robot", "fetch", "--footprint", "x"), "footprint"),

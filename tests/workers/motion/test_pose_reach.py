@@ -13,7 +13,7 @@ from datagen.workers.motion.pose_reach import known_arm, pose_reach, reach_codes
 from datagen.workers.motion.reach_cells import cells_of
 from datagen.workers.motion.reach_map import cell_of
 from datagen.workers.robots import ROBOTS as NAMES
-from datagen.workers.robots import gripper_of, open_largest, open_robot, robot_digest
+from datagen.workers.robots import gripper_of, open_largest, open_robot, robot_digest, robot_limits
 from scripts.known_arms import size_row
 from tests.sim_extra import needs_robots, needs_sim
 
@@ -77,6 +77,11 @@ def test_the_shipped_hands_and_maps_are_those_of_the_robots_files(name: str) -> 
         arm = measured_arm(name, float(reaches_m[step]))
         np.testing.assert_allclose(known["size"][step], size_row(arm), atol=1e-6)
         assert (known["code"] != arm.code).mean() < 1e-3
+    if (limits := robot_limits(name)).base_radius_m is not None:
+        np.testing.assert_array_equal(
+            known["base_m"], [*(limits.base_height_m or ())[:1], limits.base_radius_m]
+        )
+        np.testing.assert_array_equal(known["footprint_m"], limits.footprint_m)
     tree, radius_m = link_spheres(name)
     np.testing.assert_allclose(known[RADIUS], radius_m, atol=1e-6)
     for field, values in tree._asdict().items():
