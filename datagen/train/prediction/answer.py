@@ -12,7 +12,7 @@ import numpy as np
 
 from datagen.schemas.specification import ObservationParams
 from datagen.train.arrivals import Arrival
-from datagen.train.inputs import F64, I64
+from datagen.train.inputs import F64, I64, Bools
 from datagen.train.prediction.base_cells import (
     STATES,
     UNSEEN,
@@ -23,7 +23,7 @@ from datagen.train.prediction.base_cells import (
     seen_share,
     within_reach,
 )
-from datagen.train.prediction.frames import SensorFrame
+from datagen.train.prediction.frames import SensorFrame, moved
 from datagen.train.prediction.fusing import SeenPoints
 from datagen.train.prediction.ground import Ground
 from datagen.train.prediction.occupancy import KnownFloor
@@ -111,15 +111,30 @@ class Prediction:
     def look_next(self) -> tuple[float, float] | None:
         """How to turn the first camera to the floor of the best unseen pose; None where none scores well.
 
-        Radians: pan, counter-clockwise about the vertical from where it looks now, and tilt below level.
+        Radians: pan, counter-clockwise about the vertical from where it looks now, and tilt below level. Not
+        to floor that is in a picture already, hidden or without depth.
         """
         unseen = self.rows(UNSEEN)
+        unseen = unseen[~self._is_in_view(unseen)]
         if not len(unseen) or self.score[unseen[0]] < _LIKELY:
             return None
         T = self.grounds[0].T_world_camera
         x, y = self.base_xy_m[unseen[0]] - T[:2, 3]
         pan = math.atan2(y, x) - math.atan2(T[1, 2], T[0, 2])
         return (pan + math.pi) % (2 * math.pi) - math.pi, math.atan2(T[2, 3], math.hypot(x, y))
+
+    def _is_in_view(self, rows: I64) -> Bools:
+        """Mask (N,) of base poses whose floor lies whole in a frame's picture, seen or hidden."""
+        corners_m = self.robot.outline.radius_m * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+        floor_m = np.insert((self.base_xy_m[rows, None] + corners_m).reshape(-1, 2), 2, 0.0, axis=1)
+        found = np.zeros(len(rows), np.bool_)
+        for frame, ground in zip(self.frames, self.grounds, strict=True):
+            if (image := frame.image) is not None:
+                local_m = moved(floor_m, inverse(ground.T_world_camera))
+                pixels = image.pinhole.pixels(local_m)
+                inside = (pixels >= 0).all(axis=1) & (pixels < image.depth_m.shape[::-1]).all(axis=1)
+                found |= (inside & (local_m[:, 2] > 0)).reshape(-1, 4).all(axis=1)
+        return found
 
     @property
     def good_share(self) -> float | None:

@@ -316,9 +316,17 @@ def test_a_look_where_it_is_advised_shows_that_floor(seen: Seen, scorer: ModelSc
     T = seen.camera.T_world_camera
     yaw = np.arctan2(T[1, 2], T[0, 2]) + pan
     ahead = np.array([np.cos(yaw) * np.cos(tilt), np.sin(yaw) * np.cos(tilt), -np.sin(tilt)])
-    unseen = int(first.rows("unseen")[0])
-    there = np.append(first.base_xy_m[unseen], 0.0) - T[:3, 3]
-    np.testing.assert_allclose(ahead, there / np.linalg.norm(there), atol=1e-9)
+    there = np.append(first.base_xy_m, np.zeros((len(first.base_xy_m), 1)), axis=1) - T[:3, 3]
+    there /= np.linalg.norm(there, axis=1)[:, None]
+    advised = int((there @ ahead).argmax())
+    np.testing.assert_allclose(ahead, there[advised], atol=1e-9)
+    assert advised in first.rows("unseen") and first.score[advised] >= 0.5
+    # Of a picture that has that floor, but no depth there, the same look again would show no more.
+    T_turned = look_at(T[:3, 3], T[:3, 3] + ahead)
+    frames = (*first.frames, replace(first.frames[0], T_world_camera=T_turned))
+    grounds = (*first.grounds, replace(first.grounds[0], T_world_camera=T_turned))
+    after = replace(first, frames=frames, grounds=grounds).look_next
+    assert after is None or np.abs(np.subtract(after, first.look_next)).max() > 0.1
 
 
 def test_missing_depth_on_the_target_is_filled_and_reported(seen: Seen, scorer: ModelScorer) -> None:
