@@ -82,7 +82,7 @@ def facts_of(path: Path, report: dict[str, Any], name: str) -> dict[str, Any]:
     """The card of the shipped checkpoint at `path`."""
     checkpoint = read_checkpoint(path)
     head = checkpoint.head
-    program = ProgramScorer(released.FOLDER / released.PROGRAM)
+    program = ProgramScorer(released.FOLDER / released.PROGRAM, only_clear=True)
     return {
         "file": path.name,
         "bytes": path.stat().st_size,
