@@ -6,7 +6,8 @@
 Scenes of a run of whole grids in which some clear cell is good. Each is rendered again as the camera of its
 cloud saw it, with the noise of a stereo camera, depth in whole millimetres, and the true mask and pose.
 `predict` answers from that frame alone, from it with floor out of sight allowed, from up to three frames of
-which each further one looks where the answer before advises (`look_next`), and with a map of the house:
+which each further one looks where the answer before advises (`look_next`), then with floor out of sight
+allowed where there is no answer, and with a map of the house:
 "lidar" has what stands in a plane 0.2 m above the floor, "full" all that stands below the arm's mount; in
 turn the answer's alternatives follow a bad pose. Plans are then made from the very pose, as many draws as the
 run has. "answered": there was a best pose; "good": most draws found a plan, of all scenes.
@@ -54,6 +55,7 @@ _RESOLUTION_M = 0.05
 _LIDAR_M = 0.2
 _SEED = 0
 _ALONE, _ADVISED, _MAPPED = "1 frame alone", "3 up to three frames, as advised", "5 full map"
+_AT_LAST = "3b the same, unseen allowed where none is good"
 _IN_TURN, _TURNS = "6 full map, up to three poses in turn", 3
 
 
@@ -96,7 +98,10 @@ def main() -> None:
         }
         for scorer in scorers:
             first = answers[scorer.name, _ALONE]
-            answers[scorer.name, _ADVISED] = _advised(scorer, scene, first, robot, k)
+            answers[scorer.name, _ADVISED] = at_last = _advised(scorer, scene, first, robot, k)
+            if at_last.best is None:
+                at_last = predict(scorer, at_last.frames, robot, allow_unseen=True)
+            answers[scorer.name, _AT_LAST] = at_last
         arrived = {key: _arrived(answer, answer.best, stored) for key, answer in answers.items()}
         mapped = answers[names[0], _MAPPED]
         rows = () if mapped.best is None else (mapped.best, *alternatives(mapped))[:_TURNS]
