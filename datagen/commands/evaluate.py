@@ -93,7 +93,7 @@ def evaluate(
     kept = "" if closed_loop is None else _kept_outcomes(closed_loop, execute, workers, file)
     checkpoints, run_paths = split_paths([str(path) for path in paths])
     runs = open_evaluated_runs(run_paths)
-    if arrivals and not any(run.cells for run in runs):
+    if arrivals and closed_loop is None and not any(run.cells for run in runs):
         fix = "Name a run of --candidates-per-scene grid, or omit it"
         raise InputError("--arrival", "", "is for picks on whole grids, which no run has", fix)
     models = open_models(checkpoints, runs)
