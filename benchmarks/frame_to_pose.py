@@ -92,7 +92,9 @@ def main() -> None:
             refused += 1
             continue
         answers = {
-            (scorer.name, setting): predict(scorer, [frame], robot, known=known, allow_unseen=unseen)
+            (scorer.name, setting): predict(
+                scorer, [frame], robot, known=known, allow_unseen=unseen, grid=_grid(scorer)
+            )
             for setting, known, unseen in _settings(scene.house.house, robot)
             for scorer in scorers
         }
@@ -100,7 +102,7 @@ def main() -> None:
             first = answers[scorer.name, _ALONE]
             answers[scorer.name, _ADVISED] = at_last = _advised(scorer, scene, first, robot, k)
             if at_last.best is None:
-                at_last = predict(scorer, at_last.frames, robot, allow_unseen=True)
+                at_last = predict(scorer, at_last.frames, robot, allow_unseen=True, grid=_grid(scorer))
             answers[scorer.name, _AT_LAST] = at_last
         arrived = {key: _arrived(answer, answer.best, stored) for key, answer in answers.items()}
         mapped = answers[names[0], _MAPPED]
@@ -148,6 +150,11 @@ def _frame(scene: ReconstructedScene, index: int, camera: Camera | None = None, 
     return image_frame(RgbdImage(seen.rgb, depth_m, pinhole, mask), c.T_world_camera, {})
 
 
+def _grid(scorer: Scorer) -> int | None:
+    """Rules have the fine grid everywhere, the model where few base poses of a coarse one are good."""
+    return 51 if isinstance(scorer, ReachShare | Proximity) else None
+
+
 def _advised(
     scorer: Scorer, scene: ReconstructedScene, answer: Prediction, robot: RobotSize, index: int
 ) -> Prediction:
@@ -160,7 +167,8 @@ def _advised(
         yaw, tilt = np.arctan2(T[1, 2], T[0, 2]) + look[0], look[1]
         ahead = np.array([np.cos(yaw) * np.cos(tilt), np.sin(yaw) * np.cos(tilt), -np.sin(tilt)])
         camera = replace(scene.camera, T_world_camera=look_at(eye, eye + ahead))
-        answer = predict(scorer, [*answer.frames, _frame(scene, index, camera, view)], robot)
+        frames = [*answer.frames, _frame(scene, index, camera, view)]
+        answer = predict(scorer, frames, robot, grid=_grid(scorer))
     return answer
 
 

@@ -53,7 +53,7 @@ def find_base(
         ...     rgb, depth, K, T_map_camera, mask=mask, base_height=0.7, reach=0.9, allow_unseen=True
         ... )
         >>> answer.score.shape
-        (2601,)
+        (676,)
     """
     from datagen.train.prediction.files import checked_pose, scaled_depth
     from datagen.train.prediction.frames import Pinhole, RgbdImage, image_frame

@@ -244,7 +244,7 @@ def predict(given: PredictOptions) -> Prediction:
         ...     checkpoint, frame=[frame], base_height=robot.base_height_m[0], reach=robot.reach_m[1]
         ... )
         >>> answer.base_xy_m.shape, answer.T_world_base(0).shape
-        ((2601, 2), (4, 4))
+        ((676, 2), (4, 4))
     """
     # Imported here: the libraries of training take seconds to import.
     from datagen.train.arrivals import read_arrival

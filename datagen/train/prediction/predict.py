@@ -22,6 +22,7 @@ from datagen.train.prediction.base_cells import (
     STATES,
     UNSEEN,
     BaseCells,
+    Choice,
     RobotSize,
     choose,
     observe_cells,
@@ -41,8 +42,9 @@ if TYPE_CHECKING:
     from datagen.train.training.checkpoints import CheckpointHead
 
 _SLACK_M = 0.01  # how far a robot's sizes may be beyond those of the training data
-# Base poses along each side of the grid, 0.04 m apart: a coarser grid has none in narrow gaps of furniture.
-_SIDE = 51
+# Base poses along each side of the grid, 0.08 m apart, and 0.04 m where fewer than enough are good: in narrow
+# gaps of furniture a coarse grid has none.
+_COARSE, _FINE, _ENOUGH = 26, 51, 10
 _ALIKE = 0.05  # scores of a model that differ by this or less
 
 
@@ -101,7 +103,7 @@ def predict(
     allow_unseen: bool = False,
     arrival: Arrival | None = None,
     known: KnownFloor | None = None,
-    grid: int = _SIDE,
+    grid: int | None = None,
     seed: int = 0,
 ) -> Prediction:
     """Score a square grid of base poses around the target that the frames show.
@@ -112,7 +114,8 @@ def predict(
     click or a box in the first frame, or by a cloud's own marks; `target_center_m` (3,), world, replaces the
     estimated centre. With an `arrival` error the best is the cell with the highest expected success; without
     one, of a model's scores within 0.05 of the highest, the cell with the most room. A map of the floor that
-    is `known` is in the frame of the poses of the frames. InputError where arguments are missing or invalid.
+    is `known` is in the frame of the poses of the frames. `grid` cells lie along each side of the square,
+    without it 26, or 51 where few of those are good. InputError where arguments are missing or invalid.
     """
     if is_model := isinstance(scorer, (ModelScorer, ProgramScorer)):
         side_deg = 0.0 - math.degrees(robot.yaw_rad)
@@ -135,11 +138,18 @@ def predict(
     centre = np.array(target.center_m)
     cloud = crop_cloud(seen, centre, CROP, np.random.default_rng(seed))
     yaw_rad = 0.0 if arrival is None else arrival.yaw_std_rad
-    params = CandidateParams(per_scene="grid", grid_cells=grid)
-    cells = observe_cells(seen, centre, robot, params, yaw_rad, known)
-    score = scored(scorer, _batch(cloud, target, robot, cells))
     allowed = (CLEAR, UNSEEN) if allow_unseen else (CLEAR,)
-    choice = choose(score, cells, allowed, scorer.threshold, arrival, _ALIKE if is_model else 0.0)
+
+    def on_grid(side: int) -> tuple[BaseCells, F64, Choice]:
+        params = CandidateParams(per_scene="grid", grid_cells=side)
+        cells = observe_cells(seen, centre, robot, params, yaw_rad, known)
+        score = scored(scorer, _batch(cloud, target, robot, cells))
+        alike = _ALIKE if is_model else 0.0
+        return cells, score, choose(score, cells, allowed, scorer.threshold, arrival, alike)
+
+    cells, score, choice = on_grid(_COARSE if grid is None else grid)
+    if grid is None and len(choice.ranked) < _ENOUGH:
+        cells, score, choice = on_grid(_FINE)
     read = (note for frame in frames if frame.image is not None for note in frame.image.notes)
     notes = (*read, *_notes(grounds, filled, cloud))
     sizes = (("untrained_size", note) for note in robot_notes(scorer, robot))

@@ -32,7 +32,7 @@ def test_an_answer_as_json_picture_and_page(
 ) -> None:
     out, page = tmp_path / "a.png", tmp_path / "a.html"
     answer = json_of(capsys, arguments(made, "--out", str(out), "--html", str(page)))
-    assert len(answer["candidates"]) == 2601 and answer["best"]["state"] == "clear"
+    assert len(answer["candidates"]) == 51**2 and answer["best"]["state"] == "clear"
     scores = [c["score"] for c in answer["candidates"] if c["state"] == "clear"]
     assert answer["best"]["score"] >= max(scores) - 0.05
     T = np.array(answer["T_world_camera"][0]) @ answer["best"]["T_camera_base"]
