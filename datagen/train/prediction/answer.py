@@ -153,6 +153,7 @@ class Prediction:
 
     @property
     def target_points(self) -> int:
+        """Points of the target in the cloud that was scored."""
         return int(self.cloud.target_mask.sum())
 
     @property

@@ -47,6 +47,7 @@ class RobotSize:
 
     @property
     def outline(self) -> Footprint:
+        """Outline of the base around the mount (m)."""
         if self.footprint is not None:
             return self.footprint
         return Footprint(float(CandidateParams(scaled_base=True).radius_of_base_m(self.arm_reach_m)))
@@ -226,9 +227,9 @@ def choose(
     value, is_good = stands(score, can_stand).reshape(side, side), can_stand & ~(score < threshold)
     good = np.flatnonzero(is_good)
     if arrival is None:
-        expected, best = None, good[score[good] >= score[nominal] - alike]
+        expected, near = None, good[score[good] >= score[nominal] - alike]
         room = expected_success(is_good.astype(np.float64).reshape(side, side), step_m, _STOPS).ravel()
-        best = int(best[np.lexsort([-score[best], -room[best]])[0]])
+        best = int(near[np.lexsort([-score[near], -room[near]])[0]])
     else:
         expected = expected_success(value, step_m, arrival).ravel()
         best = int(rows[np.argmax(expected[rows])])

@@ -248,7 +248,7 @@ class Flat:
 
 @given(st.floats(0, 1), st.sampled_from([0, 1]))
 @settings(max_examples=15)
-def test_a_gap_with_a_hand_of_room_has_a_pose_of_the_grid(seen: Seen, shift: float, axis: int) -> None:
+def test_a_gap_a_little_wider_than_the_base_has_a_pose(seen: Seen, shift: float, axis: int) -> None:
     """Between two walls that leave the base 6 cm, wherever they are."""
     frame, camera = sensor_frame(seen), seen.camera.T_world_camera[:2, 3]
     cells = np.full((600, 600), FREE, np.int8)  # 12 m around the camera
