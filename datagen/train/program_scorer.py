@@ -160,7 +160,8 @@ class Function:
     def run(self, constants: Mapping[str, Array], inputs: Mapping[str, Array]) -> list[Array]:
         known: dict[str, Any] = {**constants, **inputs}
         for step, dropped in zip(self.steps, self._dropped, strict=True):
-            known[step.name] = OPERATIONS[step.op](*_filled(step.args, known), **_filled(step.options, known))
+            options = {name: _filled(value, known) for name, value in step.options.items()}
+            known[step.name] = OPERATIONS[step.op](*_filled(step.args, known), **options)
             for name in dropped:
                 del known[name]
         return [known[name] for name in self.outputs]
@@ -216,13 +217,9 @@ def _named(step: Step) -> set[str]:
 
 
 def _filled(value: Any, known: Mapping[str, Any]) -> Any:
-    if isinstance(value, str):
+    if type(value) is str:
         return known[value[1:]] if value.startswith(MARK) else value
-    if isinstance(value, list | tuple):
-        return [_filled(each, known) for each in value]
-    if isinstance(value, Mapping):
-        return {key: _filled(each, known) for key, each in value.items()}
-    return value
+    return [_filled(each, known) for each in value] if type(value) in (list, tuple) else value
 
 
 def _axes(axis: Any) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from pathlib import Path
 
@@ -239,11 +239,13 @@ def test_of_about_equal_scores_the_pose_with_room_is_taken(side: int, data: st.D
     assert choose(score, cells, ("clear",), 0.5, None, 0.005).best == lone
 
 
+@dataclass
 class Flat:
+    value: float = 1.0
     name, threshold = "flat", 0.5
 
     def score(self, batch: Batch[Array]) -> F64:
-        return np.ones(len(batch))
+        return np.full(len(batch), self.value)
 
 
 @given(st.floats(0, 1), st.sampled_from([0, 1]))
@@ -263,6 +265,15 @@ def test_a_gap_a_little_wider_than_the_base_has_a_pose(seen: Seen, shift: float,
     alone = replace(alone, on_target=np.ones(50, np.bool_), image=None)
     answer = predict(Flat(), [alone], ROBOT, known=known, target_center_m=target)
     assert len(answer.rows("clear"))
+
+
+@pytest.mark.parametrize(("value", "side"), [(1.0, 26), (0.3, 51), (0.01, 26)])
+def test_the_grid_is_fine_where_few_poses_are_good_but_not_all_hopeless(value: float, side: int) -> None:
+    frame = released.sample_frame()
+    answer = datagen.predict(
+        Flat(value), frame=[frame], map=[frame / released.MAP], base_height=0.7, reach=0.9
+    )
+    assert len(answer.score) == side**2
 
 
 def test_scores_are_of_poses_where_the_base_can_stand_and_the_arm_reaches() -> None:
