@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.commands.predict import PredictOptions, predict, refuse_robot
+from datagen.commands.predict import predict, refuse_robot
+from datagen.commands.predict_options import PredictOptions
 from datagen.console.command_lines import options_of
 from datagen.console.options import File
 from datagen.display.progress import Progress
