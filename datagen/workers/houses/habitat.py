@@ -154,7 +154,8 @@ class HabitatHouses:
             bodies.append(replace(body, room_id=owner))
             carries = body.object_type in self.carrying
             if owner and carries and (body.kind == "furniture" or body.object_type in CARRYING_TYPES):
-                surfaces.extend(_surfaces(body, owner, T, local))
+                # Runs in ai2thor houses keep their scenes: its stretched furniture carries nothing.
+                surfaces.extend(_surfaces(body, owner, T, local, self.kind != "ai2thor"))
         return House(house_id, digest.hexdigest(), tuple(rooms), tuple(bodies), tuple(surfaces), findings)
 
     def examine(self, house_id: str) -> Mapping[str, int]:
@@ -346,8 +347,11 @@ def _without_ceiling(stage: Mesh) -> Mesh:
     return Mesh(stage.vertices_m, stage.faces[kept], stage.face_rgb[kept], file=file)
 
 
-def _surfaces(body: StaticBody, room_id: str, T: F64, local: Mesh) -> list[Surface]:
-    """Flat tops of an upright, unstretched body."""
+def _surfaces(body: StaticBody, room_id: str, T: F64, local: Mesh, with_stretched: bool) -> list[Surface]:
+    """Flat tops of an upright body; `T` may stretch its mesh along its own axes."""
+    factors = np.linalg.norm(T[:3, :3], axis=0)
+    if with_stretched and np.abs(factors - 1.0).max() > 1e-3:
+        T, local = T @ np.diag([*1 / factors, 1.0]), local.transformed(np.diag([*factors, 1.0]))
     if T[2, 2] < 0.999 or abs(np.linalg.det(T[:3, :3]) - 1.0) > 1e-3:
         return []
     out: list[Surface] = []
