@@ -32,6 +32,7 @@ from datagen.workers.source_statement import read_statement
 
 # Part of every digest: raise it when the same files are read differently.
 VERSION = 1
+_LISTED = 2  # part of the key of cached lists alone: digests are of what was read
 ALL = "*"  # the name of the row that holds for all objects
 _LISTS = CacheFolder("folders", most_files=64)
 _LIBRARIES = ("coacd", "pycollada", "scipy", "trimesh")
@@ -58,7 +59,7 @@ class FolderObjects(LoadedOnce):
         files, tree = find_objects(folder)
         self._files = {entry.name: entry for entry in files}
         self._table = _read_table(folder / TABLE, {*self._files, ALL})
-        key = digest_of([tree, [*self._files], SUFFIXES, VERSION, versions_of(_LIBRARIES)])
+        key = digest_of([tree, [*self._files], SUFFIXES, VERSION, _LISTED, versions_of(_LIBRARIES)])
         stored = _LISTS.load(key)
         if stored is None:
             with ThreadPoolExecutor(os.cpu_count()) as pool:

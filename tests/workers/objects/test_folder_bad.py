@@ -34,6 +34,8 @@ SDF = (
     "<sdf version='1.6'><model name='a'><link name='l'><visual name='v'><geometry>{}</geometry></visual>"
     "</link>{}</model></sdf>"
 )
+INCLUDE = "<include><uri>model://table</uri></include>"
+POSED = "<link name='m'><pose relative_to='{}'>0 0 0 0 0 0</pose></link>"
 OF_MESH = '<asset><mesh name="m" file="a.msh"/></asset>'
 BOMB = '<!DOCTYPE r [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
 JOINT = '<link name="m"/><joint name="j" type="{}"><parent link="l"/><child link="m"/></joint>'
@@ -84,6 +86,10 @@ BAD: dict[str, tuple[str, str | bytes, str]] = {
     "sdf of gazebo 1.0": ("a.sdf", "<gazebo version='1.2'><model name='a'/></gazebo>", "is not <sdf>"),
     "sdf joint": ("a.sdf", SDF.format("", "<joint name='j' type='revolute'/>"), "not rigid"),
     "sdf without size": ("a.sdf", SDF.format("<box/>", ""), "finite numbers"),
+    "sdf of a cone": ("a.sdf", SDF.format("<cone><radius>1</radius></cone>", ""), "cone"),
+    "sdf that includes": ("a.sdf", SDF.format("<sphere><radius>0.03</radius></sphere>", INCLUDE), "include"),
+    "sdf pose of nothing": ("a.sdf", SDF.format("", POSED.format("x")), "relative_to x"),
+    "sdf pose of itself": ("a.sdf", SDF.format("", POSED.format("m")), "relative_to m"),
     "mjcf joint": ("a.xml", MJCF.format("", '<joint name="h"/><geom size="0.03"/>'), "not rigid"),
     "mjcf without mesh": ("a.xml", MJCF.format("", '<geom type="mesh" mesh="m"/>'), "not among the assets"),
     "mjcf of planes": ("a.xml", MJCF.format("", '<geom type="plane" size="1 1 1"/>'), "no shape"),
