@@ -26,6 +26,7 @@ _SDF_SOLIDS = {
     **{kind: [("radius", 1), ("length", 1)] for kind in ("cylinder", "capsule")},
 }
 _SDF_OTHERS = {"mesh", "empty", "plane", "heightmap"}  # a mesh is read, and the others are no solids
+_MJCF_OTHERS = ("attach", "composite", "flexcomp", "replicate")
 _SOLIDS = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "ellipsoid": 3}
 
 
@@ -154,7 +155,7 @@ class _Mjcf:
     """One model with its includes: the compiler's settings, assets, and defaults by class."""
 
     def __init__(self, path: Path, inside: Callable[[Path], Path]) -> None:
-        self.path, self.inside, self.files = path, inside, 0
+        self.path, self.inside, self.files, self.free = path, inside, 0, 0
         self.root = self._included(path)
         self.compiler: dict[str, str] = {}
         self.defaults: dict[str, dict[str, Mapping[str, str]]] = {"": {}}
@@ -215,15 +216,23 @@ class _Mjcf:
         return T
 
     def geoms(self, body: Element, T: F64, kind: str, depth: int = 0) -> Iterator[tuple[dict[str, str], F64]]:
-        """The attributes of each geom below a body, and its body's pose. InputError for joints that move."""
+        """The attributes of each geom below a body, and the pose of what holds it.
+
+        Raises InputError for joints that move, a second free body, and elements that stand for geoms.
+        """
         if depth > _DEEPEST:
             raise _wrong(self.path, "body", "bodies are nested too deeply")
         for element in body:
             if element.tag == "joint" and self.attributes(element, kind).get("type", "hinge") != "free":
                 raise _wrong(self.path, f"joint {element.get('name', '')}", "moves: the object is not rigid")
+            if element.tag in _MJCF_OTHERS:
+                raise _wrong(self.path, element.tag, "stands for bodies or geoms and is not read")
+            self.free += element.tag in ("joint", "freejoint")
+            if self.free > 1:
+                raise _wrong(self.path, "freejoint", "is one of several: the bodies are not one rigid object")
             if element.tag == "geom":
                 yield self.attributes(element, kind), T
-            elif element.tag == "body":
+            elif element.tag in ("body", "frame"):
                 T_body = T @ self.pose(element.attrib)
                 yield from self.geoms(element, T_body, element.get("childclass", kind), depth + 1)
 
@@ -245,6 +254,10 @@ class _Mjcf:
             mesh = self.assets.get(("mesh", given.get("mesh", "")))
             if mesh is None or not mesh.get("file"):
                 raise _wrong(self.path, f"mesh {given.get('mesh', '')[:80]}", "is not among the assets")
+            if moved := mesh.attrib.keys() & {"refpos", "refquat"}:
+                raise _wrong(
+                    self.path, f"mesh {mesh.get('name', '')[:80]}", f"uses {min(moved)}, which is not read"
+                )
             scale = self.numbers(self.attributes(mesh, ""), "scale", 3, "1 1 1")
             return Piece(T, self._file(mesh, "meshdir"), scale, "", one, rgb, image)
         if kind not in _SOLIDS:

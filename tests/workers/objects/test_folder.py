@@ -366,3 +366,12 @@ _FIXED = (
 def test_poses_and_solids_of_sdf(tmp_path: Path, parts: str, size_m: tuple[float, ...]) -> None:
     (tmp_path / "a.sdf").write_text(f"<sdf version='1.9'><model name='a'>{parts}</model></sdf>")
     np.testing.assert_allclose(FolderObjects(tmp_path).load("a").size_m, size_m, atol=1e-3)
+
+
+def test_geoms_of_a_frame_are_in_its_place(tmp_path: Path) -> None:
+    board = '<frame pos="0 0 0.1" euler="0 0 90"><geom type="box" size="0.1 0.03 0.01"/></frame>'
+    post = '<geom type="box" size="0.03 0.03 0.09"/>'
+    (tmp_path / "a.xml").write_text(
+        f"<mujoco><worldbody><body><freejoint/>{board}{post}</body></worldbody></mujoco>"
+    )
+    np.testing.assert_allclose(FolderObjects(tmp_path).load("a").size_m, (0.06, 0.2, 0.2), atol=1e-5)

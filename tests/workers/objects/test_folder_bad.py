@@ -37,6 +37,8 @@ SDF = (
 INCLUDE = "<include><uri>model://table</uri></include>"
 POSED = "<link name='m'><pose relative_to='{}'>0 0 0 0 0 0</pose></link>"
 OF_MESH = '<asset><mesh name="m" file="a.msh"/></asset>'
+MOVED_MESH = '<asset><mesh name="m" file="a.msh" refpos="0 0 1"/></asset>'
+BODY = f"</body><body><freejoint/>{BALL}"
 BOMB = '<!DOCTYPE r [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
 JOINT = '<link name="m"/><joint name="j" type="{}"><parent link="l"/><child link="m"/></joint>'
 
@@ -96,6 +98,9 @@ BAD: dict[str, tuple[str, str | bytes, str]] = {
     "mjcf without size": ("a.xml", MJCF.format("", '<geom type="box" size="1 nan 1"/>'), "finite numbers"),
     "mjcf of negative size": ("a.xml", MJCF.format("", '<geom type="box" size="0.1 -1 0.1"/>'), "no volume"),
     "mjcf that is not read": ("a.xml", MJCF.format("", '<geom size="0.03" zaxis="1 0 0"/>'), "zaxis"),
+    "mjcf replicates": ("a.xml", MJCF.format("", f'<replicate count="3">{BALL}</replicate>'), "replicate"),
+    "mjcf of two bodies": ("a.xml", MJCF.format("", 2 * BODY), "not one rigid object"),
+    "mjcf moves a mesh": ("a.xml", MJCF.format(MOVED_MESH, '<geom type="mesh" mesh="m"/>'), "uses refpos"),
     "mjcf includes itself": ("a.xml", MJCF.format('<include file="a.xml"/>', BALL), "includes itself"),
     "mjcf includes outside": ("a.xml", MJCF.format('<include file="../../b.xml"/>', BALL), "not inside"),
     "mjcf includes itself twice": ("a.xml", MJCF.format(2 * '<include file="a.xml"/>', BALL), "100 files"),
