@@ -131,7 +131,7 @@ def _read_table(path: Path, names: set[str]) -> dict[str, Given]:
     fix = f"Write the columns name, {', '.join(GIVEN)}, with empty cells where nothing is known"
     text = read_regular(path, 1 << 24, fix).decode("utf-8-sig", "replace")
     rows: dict[str, Given] = {}
-    for number, row in enumerate(csv.DictReader(io.StringIO(text)), 2):
+    for number, row in enumerate(csv.DictReader(io.StringIO(text), skipinitialspace=True), 2):
         name, given, line = row.get("name") or "", Given(), f"line {number}"
         if name not in names or name in rows:
             problem = f"{name!r:.80} is {'twice here' if name in rows else 'no object'}"

@@ -134,7 +134,7 @@ def test_the_table_states_mass_density_scale_and_axis(tmp_path: Path) -> None:
     for name in ("a", "b", "c", "d"):
         write_as("stl", box(0.04, 0.05, 0.06), tmp_path / name)
     (tmp_path / "objects.csv").write_text(
-        "name,mass_kg,density_kg_m3,scale,up\n*,,800,,\na,0.3,,,\nb,,,2,x\nc,,100,,\n"
+        "name, mass_kg, density_kg_m3, scale, up\n*,,800,,\na, 0.3,,,\nb,,,2,x\nc,,100,,\n"
     )
     source = open_objects(f"folder:{tmp_path}")
     assert source.load("a").mass_kg == 0.3
