@@ -278,6 +278,11 @@ CONFIG = f"objects/a/{TABLE}.object_config.json"
             {"render_asset": f"{TABLE}.glb", "up": [0, 0, 1]},
             r"\$\.up: is not 0, 1, 0\. Turn the mesh",
         ),
+        (
+            CONFIG,
+            {"render_asset": f"{TABLE}.glb", "up": [0, 1, 0], "front": [0, 0, 1]},
+            r"\$\.front: is not 0, 0, -1\. Turn the mesh",
+        ),
         (CONFIG, {"render_asset": f"{TABLE}.glb", "scale": [1, 0, 1]}, r"\$\.scale\[1\]: 0 is not within"),
         (CONFIG, {"render_asset": f"{TABLE}.glb", "scale": [1, 1]}, r"\$\.scale: has 2 numbers"),
         (
