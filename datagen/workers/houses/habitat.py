@@ -124,6 +124,11 @@ class HabitatHouses:
         """Ids, sorted: the scene's path below the root, or the folder of scenes, without its ending."""
         return list(self.scenes)
 
+    @property
+    def changed_ns(self) -> int:
+        """When a scene was last changed: the digest covers their sizes, not their content."""
+        return max(path.stat().st_mtime_ns for path in self.scenes.values())
+
     def load(self, house_id: str) -> House:
         """The house. Raises InputError that names the file and the field."""
         scene, text = self._scene(house_id)
