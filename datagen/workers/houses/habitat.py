@@ -136,8 +136,9 @@ class HabitatHouses:
         entry = scene.get("stage_instance")
         stage = self._template(self._stage_files(entry), is_stage=True)
         digest.update(stage.digest)
-        T_world = np.eye(4) if entry.find("translation") is None else _pose(entry)
-        T_world = T_world if self.stage_turn is None else _in_world(self.stage_turn(house_id))
+        T_world = (
+            _pose(entry, is_stage=True) if self.stage_turn is None else _in_world(self.stage_turn(house_id))
+        )
         mesh = _without_ceiling(stage.mesh.transformed(T_world))
         refuse_unfit_stage(entry, mesh)
         placed: list[tuple[StaticBody, F64, F64, Mesh]] = []
@@ -290,9 +291,10 @@ def _centre_m(files: AssetFiles, template: _Template) -> F64:
     return (template.mesh.vertices_m.min(0) + template.mesh.vertices_m.max(0)).astype(np.float64) / 2
 
 
-def _pose(entry: JsonNode) -> F64:
-    """`T_world_object` of an instance."""
-    x, y, z = entry.get("translation").numbers(3, -EXTENT_M, EXTENT_M)
+def _pose(entry: JsonNode, *, is_stage: bool = False) -> F64:
+    """`T_world_object` of an instance; a stage that states no translation is at the origin."""
+    at = entry.find("translation") if is_stage else entry.get("translation")
+    x, y, z = (0.0, 0.0, 0.0) if at is None else at.numbers(3, -EXTENT_M, EXTENT_M)
     found = entry.find("rotation")
     q = np.array([1.0, 0, 0, 0] if found is None else found.numbers(4, -2.0, 2.0))
     if not 0.5 < np.linalg.norm(q) < 2.0:

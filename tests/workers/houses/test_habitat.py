@@ -176,6 +176,10 @@ def test_a_stage_stands_where_the_scene_places_it(tmp_path: Path) -> None:
     # 6 m along the file's x are turned to its -z, which is the world's y.
     np.testing.assert_allclose(house.rooms[0].polygon_m.min(0), (-1, -2), atol=1e-4)
     np.testing.assert_allclose(house.rooms[0].polygon_m.max(0), (4, 4), atol=1e-4)
+    del scene["stage_instance"]["translation"]
+    write(file, scene)
+    turned = load(tmp_path).rooms[0].polygon_m
+    np.testing.assert_allclose(turned, house.rooms[0].polygon_m + (1, 2), atol=1e-4)
 
 
 @settings(max_examples=15)
