@@ -375,3 +375,22 @@ def test_geoms_of_a_frame_are_in_its_place(tmp_path: Path) -> None:
         f"<mujoco><worldbody><body><freejoint/>{board}{post}</body></worldbody></mujoco>"
     )
     np.testing.assert_allclose(FolderObjects(tmp_path).load("a").size_m, (0.06, 0.2, 0.2), atol=1e-5)
+
+
+@pytest.mark.parametrize("others", [(), ("cup",)])
+def test_numbered_collision_meshes_are_the_parts_of_one_object(
+    tmp_path: Path, others: tuple[str, ...]
+) -> None:
+    write_as("obj", box(0.2, 0.06, 0.1), tmp_path / "board")
+    home = tmp_path / "board"
+    for k, x in enumerate((-0.05, 0.05)):
+        half = box(0.1, 0.06, 0.1)
+        half.apply_translation((x, 0, 0)).export(home / f"board_collision_{k}.obj")
+    box(0.2, 0.06, 0.1).export(home / "board_vhacd.obj")  # another decomposition, which is not added
+    for name in others:
+        box(0.05, 0.05, 0.05).export(home / f"{name}.stl")
+    source = FolderObjects(tmp_path)
+    assert source.names() == ["board", *others]
+    parts = source.load("board").convex_parts_m
+    assert sorted(float(part[:, 0].mean()) for part in parts) == pytest.approx([-0.05, 0.05])
+    assert set(source.notes["board"]) == {"mass by density"}
