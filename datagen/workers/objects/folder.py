@@ -32,7 +32,7 @@ from datagen.workers.source_statement import read_statement
 
 # Part of every digest: raise it when the same files are read differently.
 VERSION = 1
-_LISTED = 2  # part of the key of cached lists alone: digests are of what was read
+_LISTED = 3  # part of the key of cached lists alone: digests are of what was read
 ALL = "*"  # the name of the row that holds for all objects
 _LISTS = CacheFolder("folders", most_files=64)
 _LIBRARIES = ("coacd", "pycollada", "scipy", "trimesh")
@@ -102,7 +102,8 @@ class FolderObjects(LoadedOnce):
             if not isinstance(error, InputError):  # numbers that no check foresaw
                 error = InputError(entry.path, "", f"cannot be read ({type(error).__name__})", "Repair it")
             where = os.path.relpath(error.place, self._root)
-            return Found("", 0.0, {}, f"{error.problem} ({where}{error.field and ': '}{error.field})")
+            where = f"{where}: {error.field}" if error.field else where
+            return Found("", 0.0, {}, f"{error.problem} ({where}). {error.fix}")
         content = hashlib.sha256()
         arrays = stored_scan(read.scan)
         for name in sorted(arrays):

@@ -71,7 +71,7 @@ BAD: dict[str, tuple[str, str | bytes, str]] = {
     "gltf of a buffer outside": ("a.gltf", GLTF.replace(b"gltf_buffer_0", b"../../x"), "not inside"),
     "msh header": ("a.xml", MJCF.format(OF_MESH, '<geom type="mesh" mesh="m"/>'), "a.msh"),
     "flat": ("a.obj", "v 0 0 0\nv .1 0 0\nv .1 .1 0\nv 0 .1 0\nf 1 2 3\nf 1 3 4\n", "no volume"),
-    "too small": ("a.stl", box(0.001, 0.001, 0.001).export(file_type="stl"), "wrong size"),
+    "too small": ("a.stl", box(0.001, 0.001, 0.001).export(file_type="stl"), "its scale in objects.csv"),
     "of kilometres": ("a.stl", box(5000, 5000, 5000).export(file_type="stl"), "wrong size"),
     "urdf bomb": ("a.urdf", BOMB + URDF.format(BOX, ""), "document type"),
     "urdf bomb in UTF-16": ("a.urdf", (BOMB + URDF.format(BOX, "")).encode("utf-16"), "document type"),
