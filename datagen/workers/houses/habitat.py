@@ -303,7 +303,7 @@ def _pose(entry: JsonNode, *, is_stage: bool = False) -> F64:
     stretched = entry.find("non_uniform_scale")
     factors = np.full(3, 1.0 if scale is None else scale.number(1e-3, 1e3))
     if stretched is not None:
-        factors = factors * [n.number(1e-3, 1e3) for n in stretched.items(3)]
+        factors = factors * stretched.numbers(3, 1e-3, 1e3)
     T = np.eye(4)
     T[:3, :3] = rotation_of(q) * factors
     T[:3, 3] = (x, y, z)
