@@ -81,7 +81,9 @@ def read_map(path: Path) -> OccupancyMap:
         default if (given := node.find(key)) is None else given.number(0.0, 1.0)
         for key, default in (("occupied_thresh", 0.65), ("free_thresh", 0.25))
     )
-    negated = (flag := node.find("negate")) is not None and bool(flag.value)
+    negated = (flag := node.find("negate")) is not None and flag.value
+    if negated not in (0, 1):
+        raise InputError(path, "negate", f"is {negated!r:.80}", "Write 0 or 1")
     grey, alpha = read_grey(picture := path.parent / name)
     dark = grey / 255 if negated else 1 - grey / 255
     cells = np.full(grey.shape, UNKNOWN, np.int8)

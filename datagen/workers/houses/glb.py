@@ -25,7 +25,7 @@ _MAX_NODES = 10_000  # with primitives: trimesh looks for the way from the root 
 _MAX_TEXTURE_PX = 64_000_000
 _FARTHEST = 1e6  # a scene may scale millimetres
 _PLAIN = (180, 178, 174)
-_FIX = "Download the asset again, or remove the scenes that use it."
+_FIX = "Download the asset again, or remove what uses it."
 _COMPRESSED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mesh_quantization"}
 # Exceptions of trimesh, which checks little itself, for damaged files: dangling references, values of wrong
 # types, short buffers, cyclic nodes, textures that Pillow cannot read (OSError) or refuses for their size,

@@ -124,6 +124,11 @@ class HabitatHouses:
         """Ids, sorted: the scene's path below the root, or the folder of scenes, without its ending."""
         return list(self.scenes)
 
+    @property
+    def changed_ns(self) -> int:
+        """When a scene was last changed: the digest covers their sizes, not their content."""
+        return max(path.stat().st_mtime_ns for path in self.scenes.values())
+
     def load(self, house_id: str) -> House:
         """The house. Raises InputError that names the file and the field."""
         scene, text = self._scene(house_id)
@@ -131,8 +136,9 @@ class HabitatHouses:
         entry = scene.get("stage_instance")
         stage = self._template(self._stage_files(entry), is_stage=True)
         digest.update(stage.digest)
-        T_world = np.eye(4) if entry.find("translation") is None else _pose(entry)
-        T_world = T_world if self.stage_turn is None else _in_world(self.stage_turn(house_id))
+        T_world = (
+            _pose(entry, is_stage=True) if self.stage_turn is None else _in_world(self.stage_turn(house_id))
+        )
         mesh = _without_ceiling(stage.mesh.transformed(T_world))
         refuse_unfit_stage(entry, mesh)
         placed: list[tuple[StaticBody, F64, F64, Mesh]] = []
@@ -154,7 +160,8 @@ class HabitatHouses:
             bodies.append(replace(body, room_id=owner))
             carries = body.object_type in self.carrying
             if owner and carries and (body.kind == "furniture" or body.object_type in CARRYING_TYPES):
-                surfaces.extend(_surfaces(body, owner, T, local))
+                # Runs in ai2thor houses keep their scenes: its stretched furniture carries nothing.
+                surfaces.extend(_surfaces(body, owner, T, local, self.kind != "ai2thor"))
         return House(house_id, digest.hexdigest(), tuple(rooms), tuple(bodies), tuple(surfaces), findings)
 
     def examine(self, house_id: str) -> Mapping[str, int]:
@@ -284,9 +291,10 @@ def _centre_m(files: AssetFiles, template: _Template) -> F64:
     return (template.mesh.vertices_m.min(0) + template.mesh.vertices_m.max(0)).astype(np.float64) / 2
 
 
-def _pose(entry: JsonNode) -> F64:
-    """`T_world_object` of an instance."""
-    x, y, z = entry.get("translation").numbers(3, -EXTENT_M, EXTENT_M)
+def _pose(entry: JsonNode, *, is_stage: bool = False) -> F64:
+    """`T_world_object` of an instance; a stage that states no translation is at the origin."""
+    at = entry.find("translation") if is_stage else entry.get("translation")
+    x, y, z = (0.0, 0.0, 0.0) if at is None else at.numbers(3, -EXTENT_M, EXTENT_M)
     found = entry.find("rotation")
     q = np.array([1.0, 0, 0, 0] if found is None else found.numbers(4, -2.0, 2.0))
     if not 0.5 < np.linalg.norm(q) < 2.0:
@@ -295,7 +303,7 @@ def _pose(entry: JsonNode) -> F64:
     stretched = entry.find("non_uniform_scale")
     factors = np.full(3, 1.0 if scale is None else scale.number(1e-3, 1e3))
     if stretched is not None:
-        factors = factors * [n.number(1e-3, 1e3) for n in stretched.items(3)]
+        factors = factors * stretched.numbers(3, 1e-3, 1e3)
     T = np.eye(4)
     T[:3, :3] = rotation_of(q) * factors
     T[:3, 3] = (x, y, z)
@@ -346,8 +354,11 @@ def _without_ceiling(stage: Mesh) -> Mesh:
     return Mesh(stage.vertices_m, stage.faces[kept], stage.face_rgb[kept], file=file)
 
 
-def _surfaces(body: StaticBody, room_id: str, T: F64, local: Mesh) -> list[Surface]:
-    """Flat tops of an upright, unstretched body."""
+def _surfaces(body: StaticBody, room_id: str, T: F64, local: Mesh, with_stretched: bool) -> list[Surface]:
+    """Flat tops of an upright body; `T` may stretch its mesh along its own axes."""
+    factors = np.linalg.norm(T[:3, :3], axis=0)
+    if with_stretched and np.abs(factors - 1.0).max() > 1e-3:
+        T, local = T @ np.diag([*1 / factors, 1.0]), local.transformed(np.diag([*factors, 1.0]))
     if T[2, 2] < 0.999 or abs(np.linalg.det(T[:3, :3]) - 1.0) > 1e-3:
         return []
     out: list[Surface] = []

@@ -50,7 +50,7 @@ def semantic_classes(path: Path) -> list[tuple[int, str]]:
 
 
 def configured_files(config: Path, root: Path) -> AssetFiles:
-    """The files that a configuration names. InputError for one outside the root, and for a mesh not y up."""
+    """The files that a configuration names. InputError for one outside the root, and a turned mesh."""
     node = parse_json(read_regular(config, 1 << 20, FIX), str(config))
     paths = list[Path | None]()
     for key in ("render_asset", "collision_asset"):
@@ -60,9 +60,11 @@ def configured_files(config: Path, root: Path) -> AssetFiles:
             raise named.error(f"{named.text()!r} is not below {root}")
         paths.append(path)
     mesh, collision = paths[0] or config.with_name(config.name.split(".")[0] + ".glb"), paths[1]
-    up, scale = node.find("up"), node.find("scale")
-    if up is not None and np.abs(np.subtract(up.numbers(3, -1.0, 1.0), (0.0, 1.0, 0.0))).max() > 1e-3:
-        raise up.error("is not 0, 1, 0", "Turn the mesh so that y is up")
+    scale = node.find("scale")
+    for key, axis in (("up", (0, 1, 0)), ("front", (0, 0, -1))):
+        found = node.find(key)
+        if found is not None and np.abs(np.subtract(found.numbers(3, -1.0, 1.0), axis)).max() > 1e-3:
+            raise found.error(f"is not {str(axis)[1:-1]}", "Turn the mesh so that y is up and -z its front")
     if collision is not None and (collision.suffix != ".glb" or not collision.is_file()):
         collision = None
     factors = (1.0, 1.0, 1.0) if scale is None else tuple(scale.numbers(3, 1e-3, 1e3))

@@ -21,7 +21,12 @@ _FIX = "Correct the file, or remove it"
 _MOST_PIECES, _MOST_FILES, _DEEPEST = 1000, 100, 20
 # MuJoCo shows the groups below this one.
 _HIDDEN_GROUP = 3
-_SDF_SOLIDS = {"box": [("size", 3)], "sphere": [("radius", 1)], "cylinder": [("radius", 1), ("length", 1)]}
+_SDF_SOLIDS = {
+    **{"box": [("size", 3)], "sphere": [("radius", 1)], "ellipsoid": [("radii", 3)]},
+    **{kind: [("radius", 1), ("length", 1)] for kind in ("cylinder", "capsule")},
+}
+_SDF_OTHERS = {"mesh", "empty", "plane", "heightmap"}  # a mesh is read, and the others are no solids
+_MJCF_OTHERS = ("attach", "composite", "flexcomp", "replicate")
 _SOLIDS = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "ellipsoid": 3}
 
 
@@ -90,16 +95,22 @@ def _sdf(path: Path) -> Description:
     if root.tag != "sdf" or len(models) != 1:
         problem = f"is no SDF of one model, but of {len(models)}" if root.tag == "sdf" else "is not <sdf>"
         raise _wrong(path, root.tag[:80], problem)
+    if models[0].find("include") is not None:
+        raise _wrong(path, "include", "holds another model, which is not read")
     for joint in models[0].iter("joint"):
         if joint.get("type") != "fixed":
             raise _wrong(path, f"joint {joint.get('name')}", "moves: the object is not rigid")
     visuals, collisions, mass_kg = list[Piece](), list[Piece](), 0.0
+    named = {str(e.get("name")): e for tag in ("joint", "frame", "link") for e in models[0].iterfind(tag)}
     for link in models[0].iter("link"):
-        T_link = _sdf_pose(path, link)
+        T_link = _sdf_pose(path, named, link)
         mass_kg += _text(path, link, "inertial/mass", 1, "0")[0]
         for tag, pieces in (("visual", visuals), ("collision", collisions)):
             for shape in link.iterfind(tag):
-                T, rgb = T_link @ _sdf_pose(path, shape), None
+                T, rgb = _sdf_pose(path, named, shape, T_link), None
+                for each in shape.iterfind("geometry/*"):
+                    if each.tag not in _SDF_SOLIDS.keys() | _SDF_OTHERS:
+                        raise _wrong(path, each.tag[:80], "is a shape that is not read")
                 if shape.find("material/diffuse") is not None:
                     rgb = tuple(_text(path, shape, "material/diffuse", 4, "1 1 1 1")[:3])
                 uri, image = (
@@ -112,21 +123,39 @@ def _sdf(path: Path) -> Description:
                 for solid, keys in _SDF_SOLIDS.items():
                     if shape.find(f"geometry/{solid}") is not None:
                         sizes = [_text(path, shape, f"geometry/{solid}/{key}", n, "") for key, n in keys]
-                        pieces.append(Piece(T, None, scale, solid, np.concatenate(sizes), rgb, image))
+                        size = np.concatenate(sizes) * (2 if solid == "ellipsoid" else 1)
+                        pieces.append(Piece(T, None, scale, solid, size, rgb, image))
     return Description(visuals, collisions, mass_kg or None)
 
 
-def _sdf_pose(path: Path, element: Element) -> F64:
-    numbers, T = _text(path, element, "pose", 6, "0 0 0 0 0 0"), np.eye(4)
-    T[:3, :3], T[:3, 3] = rpy_rotation(numbers[3:]), numbers[:3]
-    return T
+def _sdf_pose(
+    path: Path, named: Mapping[str, Element], element: Element, T: F64 | None = None, depth: int = 0
+) -> F64:
+    """The pose of an element in its model's frame; a shape has by default that of its link, `T`."""
+    pose = element.find("pose")
+    frame = "" if pose is None else pose.get("relative_to", "")
+    if not frame and T is None:
+        frame = element.get("attached_to", "") or element.findtext("child", "")  # of a frame, of a joint
+    if frame not in ("", "__model__"):
+        if frame not in named or depth > _DEEPEST:
+            raise _wrong(path, f"pose relative_to {frame[:80]}", "is not known, or follows from itself")
+        T = _sdf_pose(path, named, named[frame], None, depth + 1)
+    elif frame or T is None:
+        T = np.eye(4)
+    if pose is None:
+        return T
+    numbers, T_own = _text(path, element, "pose", 6, "0 0 0 0 0 0"), np.eye(4)
+    if pose.get("degrees") in ("true", "1"):
+        numbers[3:] = np.radians(numbers[3:])
+    T_own[:3, :3], T_own[:3, 3] = rpy_rotation(numbers[3:]), numbers[:3]
+    return T @ T_own
 
 
 class _Mjcf:
     """One model with its includes: the compiler's settings, assets, and defaults by class."""
 
     def __init__(self, path: Path, inside: Callable[[Path], Path]) -> None:
-        self.path, self.inside, self.files = path, inside, 0
+        self.path, self.inside, self.files, self.free = path, inside, 0, 0
         self.root = self._included(path)
         self.compiler: dict[str, str] = {}
         self.defaults: dict[str, dict[str, Mapping[str, str]]] = {"": {}}
@@ -187,15 +216,23 @@ class _Mjcf:
         return T
 
     def geoms(self, body: Element, T: F64, kind: str, depth: int = 0) -> Iterator[tuple[dict[str, str], F64]]:
-        """The attributes of each geom below a body, and its body's pose. InputError for joints that move."""
+        """The attributes of each geom below a body, and the pose of what holds it.
+
+        Raises InputError for joints that move, a second free body, and elements that stand for geoms.
+        """
         if depth > _DEEPEST:
             raise _wrong(self.path, "body", "bodies are nested too deeply")
         for element in body:
             if element.tag == "joint" and self.attributes(element, kind).get("type", "hinge") != "free":
                 raise _wrong(self.path, f"joint {element.get('name', '')}", "moves: the object is not rigid")
+            if element.tag in _MJCF_OTHERS:
+                raise _wrong(self.path, element.tag, "stands for bodies or geoms and is not read")
+            self.free += element.tag in ("joint", "freejoint")
+            if self.free > 1:
+                raise _wrong(self.path, "freejoint", "is one of several: the bodies are not one rigid object")
             if element.tag == "geom":
                 yield self.attributes(element, kind), T
-            elif element.tag == "body":
+            elif element.tag in ("body", "frame"):
                 T_body = T @ self.pose(element.attrib)
                 yield from self.geoms(element, T_body, element.get("childclass", kind), depth + 1)
 
@@ -217,6 +254,10 @@ class _Mjcf:
             mesh = self.assets.get(("mesh", given.get("mesh", "")))
             if mesh is None or not mesh.get("file"):
                 raise _wrong(self.path, f"mesh {given.get('mesh', '')[:80]}", "is not among the assets")
+            if moved := mesh.attrib.keys() & {"refpos", "refquat"}:
+                raise _wrong(
+                    self.path, f"mesh {mesh.get('name', '')[:80]}", f"uses {min(moved)}, which is not read"
+                )
             scale = self.numbers(self.attributes(mesh, ""), "scale", 3, "1 1 1")
             return Piece(T, self._file(mesh, "meshdir"), scale, "", one, rgb, image)
         if kind not in _SOLIDS:

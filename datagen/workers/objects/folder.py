@@ -32,6 +32,7 @@ from datagen.workers.source_statement import read_statement
 
 # Part of every digest: raise it when the same files are read differently.
 VERSION = 1
+_LISTED = 3  # part of the key of cached lists alone: digests are of what was read
 ALL = "*"  # the name of the row that holds for all objects
 _LISTS = CacheFolder("folders", most_files=64)
 _LIBRARIES = ("coacd", "pycollada", "scipy", "trimesh")
@@ -58,7 +59,7 @@ class FolderObjects(LoadedOnce):
         files, tree = find_objects(folder)
         self._files = {entry.name: entry for entry in files}
         self._table = _read_table(folder / TABLE, {*self._files, ALL})
-        key = digest_of([tree, [*self._files], SUFFIXES, VERSION, versions_of(_LIBRARIES)])
+        key = digest_of([tree, [*self._files], SUFFIXES, VERSION, _LISTED, versions_of(_LIBRARIES)])
         stored = _LISTS.load(key)
         if stored is None:
             with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -101,7 +102,8 @@ class FolderObjects(LoadedOnce):
             if not isinstance(error, InputError):  # numbers that no check foresaw
                 error = InputError(entry.path, "", f"cannot be read ({type(error).__name__})", "Repair it")
             where = os.path.relpath(error.place, self._root)
-            return Found("", 0.0, {}, f"{error.problem} ({where}{error.field and ': '}{error.field})")
+            where = f"{where}: {error.field}" if error.field else where
+            return Found("", 0.0, {}, f"{error.problem} ({where}). {error.fix}")
         content = hashlib.sha256()
         arrays = stored_scan(read.scan)
         for name in sorted(arrays):
@@ -130,7 +132,7 @@ def _read_table(path: Path, names: set[str]) -> dict[str, Given]:
     fix = f"Write the columns name, {', '.join(GIVEN)}, with empty cells where nothing is known"
     text = read_regular(path, 1 << 24, fix).decode("utf-8-sig", "replace")
     rows: dict[str, Given] = {}
-    for number, row in enumerate(csv.DictReader(io.StringIO(text)), 2):
+    for number, row in enumerate(csv.DictReader(io.StringIO(text), skipinitialspace=True), 2):
         name, given, line = row.get("name") or "", Given(), f"line {number}"
         if name not in names or name in rows:
             problem = f"{name!r:.80} is {'twice here' if name in rows else 'no object'}"

@@ -26,17 +26,18 @@ _INNER = ("google_16k", "google_64k", "google_512k", "poisson", "tsdf", "meshes"
 _COLLISION = re.compile(
     r"(?:^|[-_. ])(?:col|coll|collision|collider|convex|vhacd|coacd|hull|contact\d*)(?=$|[-_. ])", re.I
 )
+_NUMBER = re.compile(r"[-_. ]?\d+$")
 # Of a description beside NAME: Gazebo's model for older versions of SDF, robosuite's marker of a goal.
 _TWIN = re.compile(r"(?<=^model)-\d+_\d+$|[-_]visual$")
 
 
 @dataclass(frozen=True)
 class ObjectFiles:
-    """An object's description, or its mesh and perhaps the mesh of its collision parts."""
+    """An object's description, or its mesh and perhaps the meshes of its collision parts."""
 
     name: str
     path: Path
-    collision: Path | None = None
+    collisions: tuple[Path, ...] = ()
 
 
 def find_objects(root: Path) -> tuple[list[ObjectFiles], str]:
@@ -108,9 +109,21 @@ def _meshes(root: Path, meshes: list[Path]) -> list[ObjectFiles]:
         visuals = visuals[:1]
     objects: dict[str, ObjectFiles] = {}
     for path in visuals:
-        own = [c for c in collisions if len(visuals) == 1 or _COLLISION.sub("", c.stem) == path.stem]
-        objects.setdefault(path.stem, ObjectFiles(_name(path, root), path, next(iter(own), None)))
+        own = [c for c in collisions if len(visuals) == 1 or _owner(c, visuals) == path.stem]
+        # `NAME_collision_0` and `NAME_collision_1` are parts of one set, and `NAME_vhacd` is another set.
+        own = [c for c in own if (_unnumbered(c.stem), c.suffix) == (_unnumbered(own[0].stem), own[0].suffix)]
+        objects.setdefault(path.stem, ObjectFiles(_name(path, root), path, tuple(own)))
     return list(objects.values())
+
+
+def _owner(collision: Path, visuals: list[Path]) -> str:
+    """The name of the mesh that a collision mesh belongs to."""
+    name = _COLLISION.sub("", collision.stem)
+    return name if any(name == path.stem for path in visuals) else _unnumbered(name)
+
+
+def _unnumbered(name: str) -> str:
+    return _NUMBER.sub("", name)
 
 
 def _rank(path: Path) -> tuple[int, int, str]:
@@ -131,7 +144,9 @@ def _distinct(root: Path, same: list[ObjectFiles]) -> list[ObjectFiles]:
     """The best of an object's scans or formats in folders of its own; other files by their paths."""
     homes = {tuple(p for p in e.path.relative_to(root).parent.parts if p.lower() not in _INNER) for e in same}
     if len(homes) > 1:
-        return [ObjectFiles(str(e.path.relative_to(root).with_suffix("")), e.path, e.collision) for e in same]
+        return [
+            ObjectFiles(str(e.path.relative_to(root).with_suffix("")), e.path, e.collisions) for e in same
+        ]
     return [min(same, key=_scan_rank)]
 
 

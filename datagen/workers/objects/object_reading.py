@@ -88,8 +88,7 @@ def read_object(entry: ObjectFiles, root: Path, given: Given) -> ReadObject:
     if entry.path.suffix.lower() in DESCRIPTIONS:
         described = read_description(reader.inside(entry.path), reader.inside)
     else:
-        collisions = [] if entry.collision is None else [_piece(entry.collision)]
-        described = Description([_piece(entry.path)], collisions, None)
+        described = Description([_piece(entry.path)], [*map(_piece, entry.collisions)], None)
     visual = joined([_surface(reader, piece) for piece in described.visuals or described.collisions])
     bodies = [_surface(reader, piece) for piece in described.collisions]
     notes: Notes = {}

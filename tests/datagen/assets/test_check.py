@@ -14,6 +14,7 @@ from tests.datagen.test_surveys import six_houses
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG, OPEN_TOPS, arrays_of, submit_arguments
+from tests.workers.houses.test_habitat import write_hssd
 from tests.workers.objects.folder_files import box, write_as
 
 KINDS = ("obj", "ply", "stl", "mm.stl", "glb", "y.obj", "urdf", "sdf", "mjcf", "msh")
@@ -66,6 +67,20 @@ def test_houses_are_examined_as_submit_examines_them(
     printed = capsys.readouterr().out
     assert f"procthor:{houses}: 6 read, 4 unusable" in printed and "  broken: has no rooms" in printed
     refused(["assets", "check", str(houses), "--picture", str(tmp_path / "a.png")], capsys, "of objects")
+
+
+def test_a_scene_that_is_corrected_is_examined_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = write_hssd(tmp_path) / "scenes/102344022.scene_instance.json"
+    text = scene.read_text()
+    # As long as before: the digest of the source knows names and sizes alone.
+    scene.write_text(text.replace('"rotation": [1, 0, 0, 0]', '"rotation": [9, 9, 9, 9]', 1))
+    assert cli.run(["assets", "check", str(tmp_path)]) == 0
+    assert "1 unusable" in capsys.readouterr().out
+    scene.write_text(text)
+    assert cli.run(["assets", "check", str(tmp_path)]) == 0
+    assert "unusable" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("given", ["no/such/folder", "builtin", "procthor:no/such", "README.md"])

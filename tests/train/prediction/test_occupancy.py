@@ -67,6 +67,7 @@ def test_negated_and_transparent_maps(tmp_path: Path) -> None:
         (YAML.replace("0.05", ".nan"), "resolution"),
         (YAML.replace(", 0.3", ""), "origin"),
         (YAML.replace("trinary", "raw"), "mode"),
+        (YAML.replace("negate: 0", "negate: '0'"), "negate"),
         (YAML.replace("map.pgm", "/dev/zero"), "/dev/zero"),
         (YAML.replace("map.pgm", "map.yaml"), "map.yaml"),
         (YAML.replace("image: map.pgm\n", ""), "image"),

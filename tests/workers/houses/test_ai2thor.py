@@ -217,6 +217,7 @@ def test_broken_scenes_are_named(root: Path, stage: str | None, objects: Any, na
         ({"translation": [1, float("nan"), 3]}, r"translation\[1\]: nan"),
         ({"rotation": [0, 0, 0, 0]}, "not a unit quaternion"),
         ({"uniform_scale": 0}, "uniform_scale: 0"),
+        ({"non_uniform_scale": [1, 2]}, "non_uniform_scale: has 2 numbers, not 3"),
         ({"template_name": "objects/../../secret"}, "not a path below"),
     ],
 )

@@ -176,6 +176,10 @@ def test_a_stage_stands_where_the_scene_places_it(tmp_path: Path) -> None:
     # 6 m along the file's x are turned to its -z, which is the world's y.
     np.testing.assert_allclose(house.rooms[0].polygon_m.min(0), (-1, -2), atol=1e-4)
     np.testing.assert_allclose(house.rooms[0].polygon_m.max(0), (4, 4), atol=1e-4)
+    del scene["stage_instance"]["translation"]
+    write(file, scene)
+    turned = load(tmp_path).rooms[0].polygon_m
+    np.testing.assert_allclose(turned, house.rooms[0].polygon_m + (1, 2), atol=1e-4)
 
 
 @settings(max_examples=15)
@@ -209,6 +213,30 @@ def test_any_pose_and_scale_places_the_mesh(
     np.testing.assert_allclose(found.max(0), expected.max(0), atol=2e-4)
     parts = np.concatenate(body.convex_parts_m)
     np.testing.assert_allclose(parts.max(0), expected.max(0), atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    "stretch",
+    [
+        (0.7529410867130109, 0.9132418735931008, 1.2),
+        (0.9994301199913064, 0.9985916020164893, 0.998558581047224),  # as many pieces of HSSD
+        (2.0, 1.0, 0.5),
+    ],
+)
+def test_a_stretched_table_carries_objects_on_its_stretched_top(
+    tmp_path: Path, stretch: tuple[float, float, float]
+) -> None:
+    root = write_hssd(tmp_path)
+    scene = json.loads((root / "scenes/102344022.scene_instance.json").read_text())
+    turn = (np.cos(0.2), 0.0, np.sin(0.2), 0.0)
+    scene["object_instances"] = [placed(TABLE, (3.0, 0.1, 2.5), turn) | {"non_uniform_scale": list(stretch)}]
+    write(root / "scenes/102344022.scene_instance.json", scene)
+    (surface,) = load(root).surfaces
+    T, size_m = surface.T_world_surface, np.array(surface.size_m)
+    np.testing.assert_allclose(size_m, (1.4 * stretch[0], 0.8 * stretch[2]), atol=0.042)  # cells of 2 cm
+    np.testing.assert_allclose(T[:3, 3], (3.0, -2.5, 0.1 + 0.74 * stretch[1]), atol=0.022)
+    c, s = np.cos(0.4), np.sin(0.4)
+    np.testing.assert_allclose(T[:3, :3], [[c, -s, 0], [s, c, 0], [0, 0, 1]], atol=2e-3)
 
 
 def test_a_mesh_of_two_sizes_is_of_its_own_size_whatever_was_loaded_before(tmp_path: Path) -> None:
@@ -253,6 +281,11 @@ CONFIG = f"objects/a/{TABLE}.object_config.json"
             CONFIG,
             {"render_asset": f"{TABLE}.glb", "up": [0, 0, 1]},
             r"\$\.up: is not 0, 1, 0\. Turn the mesh",
+        ),
+        (
+            CONFIG,
+            {"render_asset": f"{TABLE}.glb", "up": [0, 1, 0], "front": [0, 0, 1]},
+            r"\$\.front: is not 0, 0, -1\. Turn the mesh",
         ),
         (CONFIG, {"render_asset": f"{TABLE}.glb", "scale": [1, 0, 1]}, r"\$\.scale\[1\]: 0 is not within"),
         (CONFIG, {"render_asset": f"{TABLE}.glb", "scale": [1, 1]}, r"\$\.scale: has 2 numbers"),

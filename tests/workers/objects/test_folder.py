@@ -134,7 +134,7 @@ def test_the_table_states_mass_density_scale_and_axis(tmp_path: Path) -> None:
     for name in ("a", "b", "c", "d"):
         write_as("stl", box(0.04, 0.05, 0.06), tmp_path / name)
     (tmp_path / "objects.csv").write_text(
-        "name,mass_kg,density_kg_m3,scale,up\n*,,800,,\na,0.3,,,\nb,,,2,x\nc,,100,,\n"
+        "name, mass_kg, density_kg_m3, scale, up\n*,,800,,\na, 0.3,,,\nb,,,2,x\nc,,100,,\n"
     )
     source = open_objects(f"folder:{tmp_path}")
     assert source.load("a").mass_kg == 0.3
@@ -300,3 +300,97 @@ def test_a_mujoco_model_is_read_with_includes_classes_and_solids(tmp_path: Path)
     assert len(blocks.convex_parts_m) == 2 and blocks.mass_kg == pytest.approx(700 * 2 * 0.04**3, rel=1e-5)
     assert source.load("ball").mass_kg == 0.1
     np.testing.assert_allclose(can.size_m, (0.06, 0.1, 0.06), atol=1e-3)  # it lies, as the file has it
+
+
+def _sdf_shape(solid: str, pose: str) -> str:
+    shape = f"{pose}<geometry>{solid}</geometry>"
+    return f"<visual name='v'>{shape}</visual><collision name='c'>{shape}</collision>"
+
+
+_POST = _sdf_shape("<box><size>0.06 0.06 0.2</size></box>", "")
+_BOARD = _sdf_shape("<box><size>0.2 0.06 0.02</size></box>", "")
+_ABOVE = "<link name='b'><pose relative_to='{}'>0 0 {} 0 0 0</pose>" + _BOARD + "</link>"
+_UPRIGHT = "<link name='a'><pose>0 0 0.1 0 0 0</pose>" + _POST + "</link>"
+_FIXED = (
+    "<joint name='j' type='fixed'><pose {}>0 0 0.1 0 0 0</pose><parent>a</parent><child>b</child></joint>"
+)
+
+
+@pytest.mark.parametrize(
+    ("parts", "size_m"),
+    [
+        (
+            "<link name='a'>"
+            + _sdf_shape(
+                "<box><size>0.2 0.06 0.1</size></box>", "<pose degrees='true'>0 0 0.05 0 0 90</pose>"
+            )
+            + "</link>",
+            (0.06, 0.2, 0.1),
+        ),
+        (_UPRIGHT + _ABOVE.format("a", 0.11), (0.2, 0.06, 0.22)),
+        # As `gz sdf -p` writes a URDF's joints.
+        (_UPRIGHT + _FIXED.format("relative_to='a'") + _ABOVE.format("j", 0.01), (0.2, 0.06, 0.22)),
+        (
+            _UPRIGHT + "<frame name='f' attached_to='a'><pose>0 0 0.1 0 0 0</pose></frame>"
+            "<link name='b'><pose relative_to='f'>0 0 0.01 0 0 0</pose>" + _BOARD + "</link>",
+            (0.2, 0.06, 0.22),
+        ),
+        (
+            "<link name='a'><pose>0 0 0.5 0 0 0</pose>"
+            + _sdf_shape(
+                "<box><size>0.06 0.06 0.2</size></box>", "<pose relative_to='__model__'>0 0 0.6 0 0 0</pose>"
+            )
+            + _sdf_shape("<box><size>0.2 0.06 0.02</size></box>", "<pose>0 0 0.21 0 0 0</pose>")
+            + "</link>",
+            (0.2, 0.06, 0.22),
+        ),
+        (
+            "<link name='a'>"
+            + _sdf_shape(
+                "<capsule><radius>0.03</radius><length>0.1</length></capsule>",
+                "<pose>0 0 0.08 0 0 0</pose>",
+            )
+            + _sdf_shape("<box><size>0.1 0.1 0.02</size></box>", "<pose>0 0 0.01 0 0 0</pose>")
+            + "</link>",
+            (0.1, 0.1, 0.16),
+        ),
+        (
+            "<link name='a'>"
+            + _sdf_shape("<ellipsoid><radii>0.03 0.05 0.04</radii></ellipsoid>", "")
+            + "</link>",
+            (0.06, 0.1, 0.08),
+        ),
+    ],
+    ids=["degrees", "link", "joint", "frame", "model", "capsule", "ellipsoid"],
+)
+def test_poses_and_solids_of_sdf(tmp_path: Path, parts: str, size_m: tuple[float, ...]) -> None:
+    (tmp_path / "a.sdf").write_text(f"<sdf version='1.9'><model name='a'>{parts}</model></sdf>")
+    np.testing.assert_allclose(FolderObjects(tmp_path).load("a").size_m, size_m, atol=1e-3)
+
+
+def test_geoms_of_a_frame_are_in_its_place(tmp_path: Path) -> None:
+    board = '<frame pos="0 0 0.1" euler="0 0 90"><geom type="box" size="0.1 0.03 0.01"/></frame>'
+    post = '<geom type="box" size="0.03 0.03 0.09"/>'
+    (tmp_path / "a.xml").write_text(
+        f"<mujoco><worldbody><body><freejoint/>{board}{post}</body></worldbody></mujoco>"
+    )
+    np.testing.assert_allclose(FolderObjects(tmp_path).load("a").size_m, (0.06, 0.2, 0.2), atol=1e-5)
+
+
+@pytest.mark.parametrize("others", [(), ("cup",)])
+def test_numbered_collision_meshes_are_the_parts_of_one_object(
+    tmp_path: Path, others: tuple[str, ...]
+) -> None:
+    write_as("obj", box(0.2, 0.06, 0.1), tmp_path / "board")
+    home = tmp_path / "board"
+    for k, x in enumerate((-0.05, 0.05)):
+        half = box(0.1, 0.06, 0.1)
+        half.apply_translation((x, 0, 0)).export(home / f"board_collision_{k}.obj")
+    box(0.2, 0.06, 0.1).export(home / "board_vhacd.obj")  # another decomposition, which is not added
+    for name in others:
+        box(0.05, 0.05, 0.05).export(home / f"{name}.stl")
+    source = FolderObjects(tmp_path)
+    assert source.names() == ["board", *others]
+    parts = source.load("board").convex_parts_m
+    assert sorted(float(part[:, 0].mean()) for part in parts) == pytest.approx([-0.05, 0.05])
+    assert set(source.notes["board"]) == {"mass by density"}

@@ -34,7 +34,11 @@ SDF = (
     "<sdf version='1.6'><model name='a'><link name='l'><visual name='v'><geometry>{}</geometry></visual>"
     "</link>{}</model></sdf>"
 )
+INCLUDE = "<include><uri>model://table</uri></include>"
+POSED = "<link name='m'><pose relative_to='{}'>0 0 0 0 0 0</pose></link>"
 OF_MESH = '<asset><mesh name="m" file="a.msh"/></asset>'
+MOVED_MESH = '<asset><mesh name="m" file="a.msh" refpos="0 0 1"/></asset>'
+BODY = f"</body><body><freejoint/>{BALL}"
 BOMB = '<!DOCTYPE r [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
 JOINT = '<link name="m"/><joint name="j" type="{}"><parent link="l"/><child link="m"/></joint>'
 
@@ -67,7 +71,7 @@ BAD: dict[str, tuple[str, str | bytes, str]] = {
     "gltf of a buffer outside": ("a.gltf", GLTF.replace(b"gltf_buffer_0", b"../../x"), "not inside"),
     "msh header": ("a.xml", MJCF.format(OF_MESH, '<geom type="mesh" mesh="m"/>'), "a.msh"),
     "flat": ("a.obj", "v 0 0 0\nv .1 0 0\nv .1 .1 0\nv 0 .1 0\nf 1 2 3\nf 1 3 4\n", "no volume"),
-    "too small": ("a.stl", box(0.001, 0.001, 0.001).export(file_type="stl"), "wrong size"),
+    "too small": ("a.stl", box(0.001, 0.001, 0.001).export(file_type="stl"), "its scale in objects.csv"),
     "of kilometres": ("a.stl", box(5000, 5000, 5000).export(file_type="stl"), "wrong size"),
     "urdf bomb": ("a.urdf", BOMB + URDF.format(BOX, ""), "document type"),
     "urdf bomb in UTF-16": ("a.urdf", (BOMB + URDF.format(BOX, "")).encode("utf-16"), "document type"),
@@ -84,12 +88,19 @@ BAD: dict[str, tuple[str, str | bytes, str]] = {
     "sdf of gazebo 1.0": ("a.sdf", "<gazebo version='1.2'><model name='a'/></gazebo>", "is not <sdf>"),
     "sdf joint": ("a.sdf", SDF.format("", "<joint name='j' type='revolute'/>"), "not rigid"),
     "sdf without size": ("a.sdf", SDF.format("<box/>", ""), "finite numbers"),
+    "sdf of a cone": ("a.sdf", SDF.format("<cone><radius>1</radius></cone>", ""), "cone"),
+    "sdf that includes": ("a.sdf", SDF.format("<sphere><radius>0.03</radius></sphere>", INCLUDE), "include"),
+    "sdf pose of nothing": ("a.sdf", SDF.format("", POSED.format("x")), "relative_to x"),
+    "sdf pose of itself": ("a.sdf", SDF.format("", POSED.format("m")), "relative_to m"),
     "mjcf joint": ("a.xml", MJCF.format("", '<joint name="h"/><geom size="0.03"/>'), "not rigid"),
     "mjcf without mesh": ("a.xml", MJCF.format("", '<geom type="mesh" mesh="m"/>'), "not among the assets"),
     "mjcf of planes": ("a.xml", MJCF.format("", '<geom type="plane" size="1 1 1"/>'), "no shape"),
     "mjcf without size": ("a.xml", MJCF.format("", '<geom type="box" size="1 nan 1"/>'), "finite numbers"),
     "mjcf of negative size": ("a.xml", MJCF.format("", '<geom type="box" size="0.1 -1 0.1"/>'), "no volume"),
     "mjcf that is not read": ("a.xml", MJCF.format("", '<geom size="0.03" zaxis="1 0 0"/>'), "zaxis"),
+    "mjcf replicates": ("a.xml", MJCF.format("", f'<replicate count="3">{BALL}</replicate>'), "replicate"),
+    "mjcf of two bodies": ("a.xml", MJCF.format("", 2 * BODY), "not one rigid object"),
+    "mjcf moves a mesh": ("a.xml", MJCF.format(MOVED_MESH, '<geom type="mesh" mesh="m"/>'), "uses refpos"),
     "mjcf includes itself": ("a.xml", MJCF.format('<include file="a.xml"/>', BALL), "includes itself"),
     "mjcf includes outside": ("a.xml", MJCF.format('<include file="../../b.xml"/>', BALL), "not inside"),
     "mjcf includes itself twice": ("a.xml", MJCF.format(2 * '<include file="a.xml"/>', BALL), "100 files"),
