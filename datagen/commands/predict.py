@@ -100,9 +100,9 @@ def predict(given: PredictOptions) -> Prediction:
         All poses. `level` is "good", "doubtful" or "none", for `reasons`. `best` is the row of the best clear
         pose (None where none has a good score), `T_world_base(row)` and `T_camera_base(row)` are 4x4 poses of
         the arm's mount (x to the base's front), `base_xy_m` (N, 2) and `yaw_rad` (N,) those of all rows, and
-        `score` (N,) their scores, 0 where the base cannot stand or the arm does not reach. World is the frame
-        of `T_world_camera` where frames have it, as a robot's map; else its origin is on the floor below the
-        camera. A frame in Python may also be a SensorFrame.
+        `score` (N,) their scores, 0 where the base cannot stand or the arm is over 6 cm too short. World is
+        the frame of `T_world_camera` where frames have it, as a robot's map; else its origin is on the floor
+        below the camera. A frame in Python may also be a SensorFrame.
 
     Raises:
         InputError: A frame, the checkpoint or an option cannot be used.

@@ -46,6 +46,8 @@ _SLACK_M = 0.01  # how far a robot's sizes may be beyond those of the training d
 # gaps of furniture a coarse grid has none. Not where enough have a score and all are about 0.
 _COARSE, _FINE, _ENOUGH = 26, 51, 10
 _ALIKE = 0.05  # scores of a model that differ by this or less
+# Poses that far out of reach of the target's centre have scores: it is estimated, and grasps lie around it.
+_BEYOND_M = 0.06
 
 
 def load_scorer(checkpoint: str | Path | None = None) -> ModelScorer | ProgramScorer:
@@ -108,15 +110,15 @@ def predict(
 ) -> Prediction:
     """Score a square grid of base poses around the target that the frames show.
 
-    A model's score is 0 where the base cannot stand and where the arm does not reach. Several frames need a
-    pose each. `camera_height_m` is that of the camera that took the frame; with `gravity` (3,), in its frame,
-    or the floor in sight it gives the pose of a frame that has none. The target is given by masks, by one
-    click or a box in the first frame, or by a cloud's own marks; `target_center_m` (3,), world, replaces the
-    estimated centre. With an `arrival` error the best is the cell with the highest expected success; without
-    one, of a model's scores within 0.05 of the highest, the cell with the most room. A map of the floor that
-    is `known` is in the frame of the poses of the frames. `grid` cells lie along each side of the square,
-    without it 26, or 51 where few of those are good and not all score about 0. InputError where arguments are
-    missing or invalid.
+    A model's score is 0 where the base cannot stand, and where the arm is over 6 cm too short for the
+    target's centre. Several frames need a pose each. `camera_height_m` is that of the camera that took the
+    frame; with `gravity` (3,), in its frame, or floor in sight it gives the pose of a frame that has none.
+    The target is given by masks, by one click or a box in the first frame, or by a cloud's own marks;
+    `target_center_m` (3,), world, replaces the estimated centre. With an `arrival` error the best is the cell
+    with the highest expected success; without one, of a model's scores within 0.05 of the highest, the cell
+    with the most room. A map of the floor that is `known` is in the frame of the poses of the frames. `grid`
+    cells lie along each side of the square, without it 26, or 51 where few of those are good and not all
+    score about 0. InputError where arguments are missing or invalid.
     """
     if is_model := isinstance(scorer, (ModelScorer, ProgramScorer)):
         side_deg = 0.0 - math.degrees(robot.yaw_rad)
@@ -253,7 +255,8 @@ def _locate(seen: SeenPoints) -> TargetBox:
 
 def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, cells: BaseCells) -> Batch[Array]:
     """The base poses as input of a scorer; `base_is_clear` is false where it cannot stand or get to."""
-    n, near = len(cells.offset_m), within_reach(cells.offset_m, target.center_m[2], robot)
+    n, longer = len(cells.offset_m), replace(robot, arm_reach_m=robot.arm_reach_m + _BEYOND_M)
+    near = within_reach(cells.offset_m, target.center_m[2], longer)
 
     def one(value: float) -> Array:
         return np.array([value], np.float32)
