@@ -28,7 +28,7 @@ from datagen.train.observed_visibility import visible_share
 
 ENCODE, SCORE = "encode", "score"  # functions of a program
 POINTS = 4096  # of a cloud; those of shorter ones are padded
-AT_ONCE = 125  # candidates in one call; 625 are a grid
+AT_ONCE = 64  # candidates in one call: what more of them need leaves the processor cache
 CLOUD = ("points_m", "rgb", "mask", "count", "height_m", "base_height_m", "reach_m")
 TOKENS = ("same", "left", "centres_m", "valid", "numbers", "vectors", "tensors", "radius_m", "rise_m")
 TO_SCORE = ("camera_rise_m", "reach_m", "poses", "base_xy_m", "rho", "codes")
