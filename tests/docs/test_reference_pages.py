@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
+import datagen
 from datagen.commands.submit import SubmitOptions
 from datagen.configuration.specify import specify
 from datagen.schemas.fields import SCHEMAS
@@ -46,6 +47,13 @@ def test_the_page_of_robots_is_up_to_date() -> None:
     assert (REPOSITORY / "docs/reference/robots.md").read_text("utf-8") == robots_page.page(), (
         "run `make docs`"
     )
+
+
+def test_the_page_of_python_has_all_that_the_package_offers() -> None:
+    page = (REPOSITORY / "docs/reference/python.md").read_text("utf-8")
+    named = {"label_sources", "houses", "objects", "robots"}  # of registries, in the guide
+    offered = [name for name in datagen.__all__ if name not in named | {"__version__", "TorchStream"}]
+    assert [name for name in offered if f"{name}\n" not in page] == []
 
 
 def test_every_field_has_a_unit_or_is_a_name_and_says_what_it_means() -> None:
