@@ -22,8 +22,17 @@ A run's specification is everything that decides its samples; its hash names the
 Fields that are absent by default are commented out, with the values that they have once set: `arm` is for
 `plan` and `sim`, `arm.trial` and `arm.disturbance` for `sim`. Comments give ranges and choices.
 
-`plan` and `sim` labels with `within = "in-range"` have other defaults of `places`, `n_clutter` and `decisive`
-([places](../explanation/label-sources.md#which-places)); `places = {}` and `decisive = 0` mean none.
+Where neither the file nor an option sets them, `submit` sets
+
+- `scaled_base = true`, unless the robot has a base of its own;
+- the sizes of a robot: `arm_reach_m`, `arm_reach_step_m`, `base_height_m`, `base_radius_m`, `footprint_m`,
+  and `yaw_rad` where its side is to the target;
+- for `plan` and `sim` without `within`: `per_scene = "grid"`; for whole grids and decisive scenes
+  `robots_per_scene = 1`;
+- for `plan` and `sim` with `within = "in-range"`: `places`, `n_clutter` and `decisive`
+  ([places](../explanation/label-sources.md#which-places); `places = {}` and `decisive = 0` mean none), and
+  `in_range_by` ([candidates](../explanation/label-sources.md#which-candidates));
+- `arm.motion.nearby_rounds = 3`, and for `sim` the section `arm.trial`.
 
 """
 _RESERVED = {"label_source", "houses", "objects", "scenes_from", "engines"}

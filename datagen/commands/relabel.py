@@ -38,9 +38,9 @@ def relabel(
 
     Distances are in metres, or shares of the reach with --distance planar-over-reach or mount-over-reach.
     Parameters that are not given stay as in the run; an option overrides the file. The new run equals that of
-    `datagen submit heuristic --scenes-from RUN`, and shares all files except labels, scores and ids. The same
-    command again resumes it, or extends it after the run has grown. The parts of a merged run are relabelled
-    one by one.
+    `datagen submit heuristic --scenes-from RUN`, and has copies of all arrays except labels, scores and ids.
+    The same command again resumes it, or extends it after the run has grown. The parts of a merged run are
+    relabelled one by one.
 
     For example: datagen relabel runs/first --tau 0.6 --out runs/stricter
 

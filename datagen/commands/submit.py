@@ -103,7 +103,7 @@ class SubmitOptions(JobOptions):
     ] = None
     candidates_per_scene: Annotated[
         int | str | None,
-        _text("Candidates sampled per scene from the 25x25 grid, or grid for all 625. [default: 60]"),
+        _text("Candidates per scene, or grid for all 625. [default: 60; grid for plan and sim of all cells]"),
     ] = None
     split: Annotated[
         Literal["train", "val", "test", "all"] | None,

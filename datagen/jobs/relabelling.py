@@ -108,7 +108,7 @@ def _open_target(storage: Storage, source: Run, spec: Specification) -> Run:
     run = Run.create_or_open(storage, manifest, source.n)
     if run.layout != source.layout:
         problem = f"is {run.layout.scenes_per_shard}, unlike in the source"
-        fix = "Choose another --out: files can be shared only shard by shard"
+        fix = "Choose another --out: arrays are copied shard by shard"
         raise InputError(f"{storage.url}/manifest.json", "layout.scenes_per_shard", problem, fix)
     return run
 

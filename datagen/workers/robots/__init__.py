@@ -160,7 +160,7 @@ def remember(place: str, name: str, digest: str) -> RobotSource:
     found = _digest(source)
     if found != digest or source.name != name:
         problem = f"holds {source.name} {found[:12]}, but the run was made with {name} {digest[:12]}"
-        fix = "Give the file that the run was started with, or start a new run"
+        fix = "Give the file that the run was started with, under that name, or start a new run"
         raise InputError("--robot", place, problem, fix)
     _read[f"{name}@{digest}"] = source
     return source

@@ -312,6 +312,9 @@ def test_a_digest_depends_on_content_and_not_on_the_place(make: Made) -> None:
     assert open_robot(f"robot@{digest}", None, 0.85).name == "robot"
     with pytest.raises(InputError, match="but the run was made with robot"):
         remember(turned, "robot", digest)
+    renamed = Path(second).rename(Path(second).with_name("new.toml"))
+    with pytest.raises(InputError, match=r"holds new .* made with robot .*under that name"):
+        remember(str(renamed), "robot", digest)
     with pytest.raises(InputError, match="a file that was not named"):
         robot_source(f"robot@{'0' * 64}")
 
