@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -76,6 +77,19 @@ def test_both_stages_from_the_command_line(
     assert head.options["weight_decay"] == 0.01
     assert [run["schema"] for run in head.data] == ["sim"]
     assert json_of(capfd, arguments)["digest"] == head.digest
+
+
+def test_a_sealed_store_trains_as_its_run(
+    first: Path, heuristic_run: Path, tiny: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    shutil.copytree(heuristic_run / "data.zarr", tmp_path / "data.zarr")
+    more = ("--epochs", "1", "--model-config", tiny)
+    capsys.readouterr()
+    assert cli.run(words("stage1", tmp_path / "data.zarr", tmp_path / "c.ckpt", *more)) == 0
+    assert "unknown for labels" in capsys.readouterr().out
+    assert equal(read_checkpoint(tmp_path / "c.ckpt").weights, read_checkpoint(first).weights)
+    assert cli.run(words("stage1", heuristic_run, first, *more)) == 0
+    assert "s of CPU for labels" in capsys.readouterr().out
 
 
 @needs_sim

@@ -20,7 +20,7 @@ from datagen.train.headings import knows_headings, refuse_mixed_headings
 from datagen.train.models import Model, build_model
 from datagen.train.models.shared import SharedModel, with_reach
 from datagen.train.rates import rate_fields
-from datagen.train.run_parts import open_parts, read_robots, refuse_mixed_labels
+from datagen.train.run_parts import JOIN_FIELDS, open_parts, read_robots, refuse_mixed_labels
 from datagen.train.splits import HouseShare, refuse_one_class, refuse_shared_houses, split_by_house
 from datagen.train.training.checkpoints import (
     Checkpoint,
@@ -201,7 +201,7 @@ def _encoded(
 
 
 def _rate_fields(job: TrainingJob, runs: tuple[str, ...]) -> tuple[str, ...]:
-    return rate_fields(open_parts(runs, ["label"], job.allow_incomplete))
+    return rate_fields(open_parts(runs, JOIN_FIELDS, job.allow_incomplete))
 
 
 def _refuse_other_labels(stage: str, stream: SampleStream) -> None:
