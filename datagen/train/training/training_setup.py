@@ -181,9 +181,10 @@ def _encoded(
 ) -> tuple[EncodedBatches, EncodedBatches]:
     """Batches of the streams' scenes from clouds that are encoded once. InputError if options exclude it."""
     options, folder = job.options, Path(job.encoded or "")
+    sides = job.runs, job.val_runs or job.runs
     excluded = {
         f"--model {model.name}": not isinstance(model, SharedModel),
-        "runs of disturbed trials": bool(_rate_fields(job, job.runs)),
+        "runs of --perturb or --draws": any(_rate_fields(job, runs) for runs in sides),
     }
     for name, is_given in excluded.items():
         if is_given:
@@ -191,8 +192,7 @@ def _encoded(
             raise InputError("datagen train", "--encoded", problem, "Omit one of them")
     assert isinstance(model, SharedModel)
     made: list[EncodedBatches] = []
-    given = (job.runs, options.seed), (job.val_runs or job.runs, None)
-    for stream, (runs, seed) in zip(streams, given, strict=True):
+    for stream, runs, seed in zip(streams, sides, (options.seed, None), strict=True):
         clouds = encoded_stream(runs, job.allow_incomplete)
         encoded = encode_runs(clouds, model, folder, seen or (lambda done, of: None))
         scenes = np.flatnonzero(np.isin(encoded.houses, sorted(stream.house_ids())))
