@@ -95,7 +95,8 @@ def prepare_training(job: TrainingJob, seen: Seen | None = None) -> tuple[Traini
         known = sorted(val.house_ids() & set(began.head.house_ids))
         if known:
             problem = f"{known[0]!r} is in the training data of --init ({len(known)} such houses)"
-            raise InputError(job.init or "", "house_id", problem, "Name runs of other houses with --val")
+            fix = "Name runs of other houses with --val, as `submit --split val` makes them"
+            raise InputError(job.init or "", "house_id", problem, fix)
     class_weights = _class_weights(train, stage.weighted)
     model = _model(job, began)
     batches = (train, val) if job.encoded is None else _encoded(job, model, (train, val), seen)
