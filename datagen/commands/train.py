@@ -72,7 +72,9 @@ def _rows(head: CheckpointHead, best: EpochRecord | None) -> Iterator[tuple[str,
     wall_s, cpu_s = head.cost.get("train_wall_s", 0.0), head.cost.get("train_cpu_s", 0.0)
     waited = head.cost.get("data_wait_s", 0.0) / wall_s if wall_s > 0 else 0.0
     yield "time", f"{seconds(wall_s)}, {waited:.1%} of it waiting for data"
-    yield "cost", f"{seconds(head.cost.get('label_cpu_s', 0.0))} of CPU for labels, {seconds(cpu_s)} to train"
+    is_known = all(run["cost"] is not None for run in head.data)  # not of a sealed store without its run
+    labels = f"{seconds(head.cost.get('label_cpu_s', 0.0))} of CPU" if is_known else "unknown"
+    yield "cost", f"{labels} for labels, {seconds(cpu_s)} of CPU to train"
 
 
 @dataclass(frozen=True)

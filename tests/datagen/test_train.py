@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,7 +18,8 @@ from datagen import cli
 from datagen.commands.train import model_sizes
 from datagen.released import released_checkpoint
 from datagen.schemas.errors import InputError
-from datagen.train.training.checkpoints import load_model, read_checkpoint
+from datagen.train.splits import split_by_house
+from datagen.train.training.checkpoints import load_model, read_checkpoint, write_checkpoint
 from datagen.train.training.training_setup import choose_device
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
@@ -78,6 +81,19 @@ def test_both_stages_from_the_command_line(
     assert json_of(capfd, arguments)["digest"] == head.digest
 
 
+def test_a_sealed_store_trains_as_its_run(
+    first: Path, heuristic_run: Path, tiny: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    shutil.copytree(heuristic_run / "data.zarr", tmp_path / "data.zarr")
+    more = ("--epochs", "1", "--model-config", tiny)
+    capsys.readouterr()
+    assert cli.run(words("stage1", tmp_path / "data.zarr", tmp_path / "c.ckpt", *more)) == 0
+    assert "unknown for labels" in capsys.readouterr().out
+    assert equal(read_checkpoint(tmp_path / "c.ckpt").weights, read_checkpoint(first).weights)
+    assert cli.run(words("stage1", heuristic_run, first, *more)) == 0
+    assert "s of CPU for labels" in capsys.readouterr().out
+
+
 @needs_sim
 def test_runs_that_do_not_fit_the_stage_are_refused(
     first: Path, heuristic_run: Path, sim_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -102,6 +118,18 @@ def test_the_released_model_is_a_start(sim_run: Path, tmp_path: Path) -> None:
     assert set(released.head.house_ids) < set(mine.head.house_ids)
     name = next(name for name in released.weights if name.startswith("token"))
     torch.testing.assert_close(mine.weights[name], released.weights[name])
+
+
+@needs_sim
+def test_no_house_that_the_start_was_trained_on_validates(
+    first: Path, sim_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """As of `released`, which was trained on all houses of the split `train`, also on a held-out tenth."""
+    start, held_out = read_checkpoint(first), sorted(split_by_house([sim_run])[1].house_ids())
+    head = replace(start.head, house_ids=(*start.head.house_ids, *held_out))
+    write_checkpoint(tmp_path / "all.ckpt", replace(start, head=head))
+    arguments = words("stage2", sim_run, tmp_path / "c.ckpt", "--init", str(tmp_path / "all.ckpt"))
+    refused(arguments, capsys, "all.ckpt", f"'{held_out[0]}'", "training data of --init", "--split val")
 
 
 def test_what_cannot_be_trained_is_refused(

@@ -294,7 +294,8 @@ class DistanceGrid:
 
     def _cells(self, points_m: Array) -> tuple[Ints, Bools]:
         cell = np.floor((points_m - self._low_m) / self._cell_m).astype(np.int32)
-        return cell, np.asarray(((cell >= 0) & (cell < self._shape)).all(-1), np.bool_)
+        x, y, z = np.moveaxis((cell >= 0) & (cell < self._shape), -1, 0)
+        return cell, x & y & z
 
 
 def _nearer(square: U8, axis: int) -> U8:
@@ -303,10 +304,10 @@ def _nearer(square: U8, axis: int) -> U8:
     After all three axes it is the squared distance in space (Felzenszwalb and Huttenlocher 2012, without
     their envelope: few steps along a line of bytes cost less).
     """
-    line, found = np.moveaxis(square, axis, 0), square.copy()
-    out = np.moveaxis(found, axis, 0)
+    line = np.ascontiguousarray(np.moveaxis(square, axis, 0))  # a shift along the last axis is slow
+    found, further = line.copy(), np.empty_like(line)
     for step in range(1, min(FARTHEST, len(line))):
-        further = line + np.uint8(step * step)
-        np.minimum(out[step:], further[:-step], out=out[step:])
-        np.minimum(out[:-step], further[step:], out=out[:-step])
-    return found
+        np.add(line, np.uint8(step * step), out=further)
+        np.minimum(found[step:], further[:-step], out=found[step:])
+        np.minimum(found[:-step], further[step:], out=found[:-step])
+    return np.moveaxis(found, 0, axis)

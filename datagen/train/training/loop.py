@@ -282,9 +282,12 @@ class TrainingProgress:
         self._shown, self._place = shown, place
         self._spent_s = self._samples = self._waited_s = self._steps = 0.0
         self._pace = Pace(lambda: self._spent_s)
+        self._stepped_s = self._validation_s = 0.0
+        self._epochs = self._epoch_steps = 0.0  # done, and the steps of each
 
     def step(self, step: TrainingStep) -> None:
         """Called after each step."""
+        self._stepped_s = self._shown.clock()
         self._spent_s, self._steps = self._spent_s + step.step_s, self._steps + 1
         self._samples, self._waited_s = self._samples + step.samples, self._waited_s + step.wait_s
         self._pace.see(self._samples, self._waited_s, self._steps)
@@ -292,6 +295,8 @@ class TrainingProgress:
 
     def epoch(self, record: dict[str, Any]) -> None:
         """Called after each epoch with its row of the history, and whether it is the `best`."""
+        self._validation_s = self._shown.clock() - self._stepped_s
+        self._epochs, self._epoch_steps = record["epoch"], record["step"] / record["epoch"]
         numbers = "".join(
             f"  {name} {record[field]:.4f}"
             for name, field in (("balanced", "val_balanced_accuracy"), ("AUC", "val_auc"))
@@ -309,6 +314,8 @@ class TrainingProgress:
 
     def _figures(self, step: TrainingStep) -> tuple[str, dict[str, object]]:
         speed, left_s = self._speed(1), self._pace.left_s(step.steps - step.step, 2)
+        if left_s is not None and self._epoch_steps:  # each epoch left ends with a validation
+            left_s += (step.steps / self._epoch_steps - self._epochs) * self._validation_s
         text = (
             f"loss {step.loss:.4f}  {speed['samples_per_s']:,.0f} samples/s  "
             f"{clock_text(left_s)} left  data {speed['loader_share']:.0%}"

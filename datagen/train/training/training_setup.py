@@ -20,7 +20,7 @@ from datagen.train.headings import knows_headings, refuse_mixed_headings
 from datagen.train.models import Model, build_model
 from datagen.train.models.shared import SharedModel, with_reach
 from datagen.train.rates import rate_fields
-from datagen.train.run_parts import open_parts, read_robots, refuse_mixed_labels
+from datagen.train.run_parts import JOIN_FIELDS, open_parts, read_robots, refuse_mixed_labels
 from datagen.train.splits import HouseShare, refuse_one_class, refuse_shared_houses, split_by_house
 from datagen.train.training.checkpoints import (
     Checkpoint,
@@ -95,7 +95,8 @@ def prepare_training(job: TrainingJob, seen: Seen | None = None) -> tuple[Traini
         known = sorted(val.house_ids() & set(began.head.house_ids))
         if known:
             problem = f"{known[0]!r} is in the training data of --init ({len(known)} such houses)"
-            raise InputError(job.init or "", "house_id", problem, "Name runs of other houses with --val")
+            fix = "Name runs of other houses with --val, as `submit --split val` makes them"
+            raise InputError(job.init or "", "house_id", problem, fix)
     class_weights = _class_weights(train, stage.weighted)
     model = _model(job, began)
     batches = (train, val) if job.encoded is None else _encoded(job, model, (train, val), seen)
@@ -181,9 +182,10 @@ def _encoded(
 ) -> tuple[EncodedBatches, EncodedBatches]:
     """Batches of the streams' scenes from clouds that are encoded once. InputError if options exclude it."""
     options, folder = job.options, Path(job.encoded or "")
+    sides = job.runs, job.val_runs or job.runs
     excluded = {
         f"--model {model.name}": not isinstance(model, SharedModel),
-        "runs of disturbed trials": bool(_rate_fields(job, job.runs)),
+        "runs of --perturb or --draws": any(_rate_fields(job, runs) for runs in sides),
     }
     for name, is_given in excluded.items():
         if is_given:
@@ -191,8 +193,7 @@ def _encoded(
             raise InputError("datagen train", "--encoded", problem, "Omit one of them")
     assert isinstance(model, SharedModel)
     made: list[EncodedBatches] = []
-    given = (job.runs, options.seed), (job.val_runs or job.runs, None)
-    for stream, (runs, seed) in zip(streams, given, strict=True):
+    for stream, runs, seed in zip(streams, sides, (options.seed, None), strict=True):
         clouds = encoded_stream(runs, job.allow_incomplete)
         encoded = encode_runs(clouds, model, folder, seen or (lambda done, of: None))
         scenes = np.flatnonzero(np.isin(encoded.houses, sorted(stream.house_ids())))
@@ -201,7 +202,7 @@ def _encoded(
 
 
 def _rate_fields(job: TrainingJob, runs: tuple[str, ...]) -> tuple[str, ...]:
-    return rate_fields(open_parts(runs, ["label"], job.allow_incomplete))
+    return rate_fields(open_parts(runs, JOIN_FIELDS, job.allow_incomplete))
 
 
 def _refuse_other_labels(stage: str, stream: SampleStream) -> None:

@@ -13,7 +13,7 @@ from datagen.display.progress import Progress
 from datagen.train.training.loop import TrainingProgress, TrainingStep
 
 RECORD: dict[str, Any] = {
-    "epoch": 3, "step": 30, "loss": 0.5, "accuracy": 0.7, "val_loss": 0.25, "val_accuracy": 0.875,
+    "epoch": 4, "step": 40, "loss": 0.5, "accuracy": 0.7, "val_loss": 0.25, "val_accuracy": 0.875,
     "val_balanced_accuracy": None, "val_auc": None, "best": True,
 }  # fmt: skip
 
@@ -46,6 +46,25 @@ def test_progress_shows_numbers_and_a_row_per_epoch():
         bar.step(step(31))
         bar.epoch(RECORD)
     told = out.getvalue()
-    assert "epoch   3  loss 0.5000  validation 0.2500  accuracy 0.8750  best" in told
+    assert "epoch   4  loss 0.5000  validation 0.2500  accuracy 0.8750  best" in told
     assert "31/100" in told and "30 samples/s  0:02:18 left  data 10%" in told
     assert "None" not in told
+
+
+def test_the_time_left_has_the_validations_of_the_epochs_left():
+    out, now_s = io.StringIO(), [0.0]
+    shown = Progress(as_json=True, clock=lambda: now_s[0], console=Console(file=out))
+    lines = TrainingProgress(shown, "a.ckpt")
+
+    def left_s(k: int) -> int:
+        lines.step(step(k))
+        now_s[0] += 20.0  # steps are counted by the time that they took
+        lines.step(step(k))
+        return json.loads(out.getvalue().splitlines()[-1])["left_s"]
+
+    assert left_s(39) == 122
+    now_s[0] += 30.0
+    lines.epoch(RECORD)
+    assert left_s(41) == 118 + 6 * 30
+    lines.epoch({**RECORD, "epoch": 10, "step": 100})
+    assert left_s(100) == 0

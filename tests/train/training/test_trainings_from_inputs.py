@@ -7,9 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from datagen import cli
 from datagen.schemas.errors import InputError
 from datagen.train.training.checkpoints import read_checkpoint
 from datagen.train.training.training_setup import prepare_training
+from tests.small_runs import CONFIG
+from tests.train.conftest import ARM, TRIED
 from tests.train.training.small import TINY_PAPER, equal, job_of, train_until
 
 
@@ -37,3 +40,14 @@ def test_another_model_is_refused(heuristic_run: Path, tmp_path: Path):
     with pytest.raises(InputError, match="--model"):
         prepare_training(asked)
     assert not inputs.exists()
+
+
+def test_rates_of_either_side_are_refused(sim_run: Path, tmp_path: Path):
+    """Encoded candidates have labels alone."""
+    (tmp_path / "plan.toml").write_text(CONFIG + ARM)
+    words = ["--candidates", "in-range", "--candidates-per-scene", str(TRIED), "--draws", "2", "--seed", "9"]
+    words += ["--config", str(tmp_path / "plan.toml"), "--out", str(tmp_path / "plan"), "--workers", "0"]
+    assert cli.run(["submit", "plan", "--n", str(2 * TRIED), *words]) == 0
+    job = replace(job_of(sim_run, tmp_path / "model", stage="sim-only"), encoded=str(tmp_path / "inputs"))
+    with pytest.raises(InputError, match="--draws"):
+        prepare_training(replace(job, val_runs=(str(tmp_path / "plan"),)))
