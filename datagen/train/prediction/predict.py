@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 
 _SLACK_M = 0.01  # how far a robot's sizes may be beyond those of the training data
 # Base poses along each side of the grid, 0.08 m apart, and 0.04 m where fewer than enough are good: in narrow
-# gaps of furniture a coarse grid has none. Not where enough have a score and all are about 0.
-_COARSE, _FINE, _ENOUGH = 26, 51, 10
+# gaps of furniture a coarse grid has none. Not where enough can be scored and none is better than hopeless.
+_COARSE, _FINE, _ENOUGH, _HOPELESS = 26, 51, 10, 0.3
 _ALIKE = 0.05  # scores of a model that differ by this or less
 # Poses that far out of reach of the target's centre have scores: it is estimated, and grasps lie around it.
 _BEYOND_M = 0.06
@@ -118,7 +118,7 @@ def predict(
     with the highest expected success; without one, of a model's scores within 0.05 of the highest, the cell
     with the most room. A map of the floor that is `known` is in the frame of the poses of the frames. `grid`
     cells lie along each side of the square, without it 26, or 51 where few of those are good and not all
-    score about 0. InputError where arguments are missing or invalid.
+    below 0.3. InputError where arguments are missing or invalid.
     """
     if is_model := isinstance(scorer, (ModelScorer, ProgramScorer)):
         side_deg = 0.0 - math.degrees(robot.yaw_rad)
@@ -152,7 +152,7 @@ def predict(
 
     cells, score, choice = on_grid(_COARSE if grid is None else grid)
     has_score = score[choice.can_stand & (score > 0)]
-    is_hopeless = len(has_score) >= _ENOUGH and has_score.max() < _ALIKE
+    is_hopeless = len(has_score) >= _ENOUGH and has_score.max() < _HOPELESS
     if grid is None and len(choice.ranked) < _ENOUGH and not is_hopeless:
         cells, score, choice = on_grid(_FINE)
     read = (note for frame in frames if frame.image is not None for note in frame.image.notes)
