@@ -280,6 +280,7 @@ def _mjcf(path: Path, inside: Callable[[Path], Path]) -> Description:
         mass_kg += float(model.numbers(each.attrib, "mass", 1, "0")[0])
     seen: list[tuple[Piece, bool, bool]] = []  # collides, is hidden
     densities: set[float] = set()
+    lacks_mass = False
     for body in model.root.iterfind("worldbody"):
         for given, T in itertools.islice(model.geoms(body, np.eye(4), ""), _MOST_PIECES + 1):
             piece = model.piece(given, T)
@@ -289,6 +290,7 @@ def _mjcf(path: Path, inside: Callable[[Path], Path]) -> Description:
             seen.append((piece, collides, float(model.numbers(given, "group", 1, "0")[0]) >= _HIDDEN_GROUP))
             if not inertials:
                 mass_kg += float(model.numbers(given, "mass", 1, "0")[0])
+                lacks_mass |= collides and "mass" not in given  # then the others' sum is not the whole
             if collides and "density" in given:
                 densities.add(float(model.numbers(given, "density", 1, "")[0]))
     pure = [p for p, collides, hidden in seen if not collides and not hidden]
@@ -296,7 +298,7 @@ def _mjcf(path: Path, inside: Callable[[Path], Path]) -> Description:
     colliding = [p for p, collides, hidden in seen if collides and hidden]
     colliding = colliding or [p for p, collides, _ in seen if collides]
     density = densities.pop() if len(densities) == 1 else None
-    return Description(shown, colliding, mass_kg or None, density or None)
+    return Description(shown, colliding, None if lacks_mass else mass_kg or None, density or None)
 
 
 def _text(path: Path, element: Element, tag: str, count: int, default: str) -> F64:

@@ -377,6 +377,16 @@ def test_geoms_of_a_frame_are_in_its_place(tmp_path: Path) -> None:
     np.testing.assert_allclose(FolderObjects(tmp_path).load("a").size_m, (0.06, 0.2, 0.2), atol=1e-5)
 
 
+def test_a_mass_of_some_geoms_is_not_that_of_the_object(tmp_path: Path) -> None:
+    head = '<geom type="box" size=".05 .02 .02" mass="0.1"/>'
+    shaft = '<geom type="box" size=".01 .01 .1" pos="0 0 -.12" density="700"/>'
+    (tmp_path / "a.xml").write_text(f"<mujoco><worldbody><body>{head}{shaft}</body></worldbody></mujoco>")
+    source = FolderObjects(tmp_path)
+    volume_m3 = 8 * (0.05 * 0.02 * 0.02 + 0.01 * 0.01 * 0.1)
+    assert source.load("a").mass_kg == pytest.approx(700 * volume_m3, rel=1e-4)
+    assert "700" in source.notes["a"]["mass by density"]
+
+
 @pytest.mark.parametrize("others", [(), ("cup",)])
 def test_numbered_collision_meshes_are_the_parts_of_one_object(
     tmp_path: Path, others: tuple[str, ...]
