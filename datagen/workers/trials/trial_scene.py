@@ -64,9 +64,10 @@ def articulation_of(robot: Robot, opening_m: float = 0.0) -> tuple[MovingBody, .
         for side, parts in zip((1.0, -1.0), robot.gripper.fingers_near(opening_m), strict=True):
             bodies.append(_sliding_finger(robot, parts, side, count, T_last_tcp, fingers))
         return tuple(bodies)
+    open_m = robot.gripper.max_opening_m / 2
     for body, joint in zip(fingers, assembly.hand.joints, strict=True):
-        if joint.upper <= joint.lower:  # the URDF has no range, or that of a driver: the file has
-            joint = replace(joint, lower=0.0, upper=robot.gripper.max_opening_m / 2)
+        if not joint.lower <= 0.0 < open_m <= joint.upper:  # the file's range, or a driver's, replaces it
+            joint = replace(joint, lower=0.0, upper=open_m)
         bodies.append(_body([(body, np.eye(4))], count, joint, T_palm @ _rounded(joint.T_parent_child)))
     return tuple(bodies)
 
