@@ -17,7 +17,7 @@ from datagen.workers.robots.urdf import Joint, rotation_rpy, rpy_rotation
 from datagen.workers.scenes import SettledScene
 from datagen.workers.trials import Disturbance
 
-# Bodies without mass still need a little, at the joint.
+# Bodies without mass and shapes still need a little, at the joint.
 _LEAST_MASS_KG, _LEAST_INERTIA_KGM2 = 1e-3, 1e-6
 _LIGHTEST_FINGER_KG = 0.02
 
@@ -37,7 +37,7 @@ class MovingBody:
     lower: float
     upper: float
     parts_m: tuple[F32, ...]  # convex, body frame
-    mass_kg: float
+    mass_kg: float  # 0 where the URDF has none: physics then takes that of the parts
     T_body_principal: F64  # (4, 4), centre of mass and principal axes
     inertia_kgm2: F64  # (3,), along them
 
@@ -128,7 +128,8 @@ def _body(
     kind = "prismatic" if joint is not None and joint.kind == "prismatic" else "revolute"
     return MovingBody(
         parent, name, kind, T_parent_child @ T_body_joint, T_body_joint, lower, upper_limit, tuple(parts),
-        max(mass, _LEAST_MASS_KG), T_body_principal, np.maximum(values, _LEAST_INERTIA_KGM2),
+        mass if parts else max(mass, _LEAST_MASS_KG), T_body_principal,
+        np.maximum(values, _LEAST_INERTIA_KGM2),
     )  # fmt: skip
 
 
