@@ -274,9 +274,10 @@ def _robot_links(
             if is_finger:
                 tune_pad(shape, friction, params.finger_friction, sum(robot.gripper.pad_size_m) / 2)
             link.attach(shape)
-        link.set_mass(body.mass_kg)
-        link.set_cmass_local_pose(sapien_pose(body.T_body_principal))
-        link.set_inertia(body.inertia_kgm2.tolist())
+        if body.mass_kg > 0:  # else as of water: SAPIEN's density of shapes
+            link.set_mass(body.mass_kg)
+            link.set_cmass_local_pose(sapien_pose(body.T_body_principal))
+            link.set_inertia(body.inertia_kgm2.tolist())
         # As in ManiSkill's agents: a real arm's controller compensates its weight.
         link.set_disable_gravity(True)
         joint = link.joint

@@ -17,7 +17,7 @@ from datagen.workers.robots.urdf import Joint, rotation_rpy, rpy_rotation
 from datagen.workers.scenes import SettledScene
 from datagen.workers.trials import Disturbance
 
-# Bodies without mass still need a little, at the joint.
+# Bodies without mass and shapes still need a little, at the joint.
 _LEAST_MASS_KG, _LEAST_INERTIA_KGM2 = 1e-3, 1e-6
 _LIGHTEST_FINGER_KG = 0.02
 
@@ -37,7 +37,7 @@ class MovingBody:
     lower: float
     upper: float
     parts_m: tuple[F32, ...]  # convex, body frame
-    mass_kg: float
+    mass_kg: float  # 0 where the URDF has none: physics then takes that of the parts
     T_body_principal: F64  # (4, 4), centre of mass and principal axes
     inertia_kgm2: F64  # (3,), along them
 
@@ -64,9 +64,10 @@ def articulation_of(robot: Robot, opening_m: float = 0.0) -> tuple[MovingBody, .
         for side, parts in zip((1.0, -1.0), robot.gripper.fingers_near(opening_m), strict=True):
             bodies.append(_sliding_finger(robot, parts, side, count, T_last_tcp, fingers))
         return tuple(bodies)
+    open_m = robot.gripper.max_opening_m / 2
     for body, joint in zip(fingers, assembly.hand.joints, strict=True):
-        if joint.upper <= joint.lower:  # the URDF has no range, or that of a driver: the file has
-            joint = replace(joint, lower=0.0, upper=robot.gripper.max_opening_m / 2)
+        if not joint.lower <= 0.0 < open_m <= joint.upper:  # the file's range, or a driver's, replaces it
+            joint = replace(joint, lower=0.0, upper=open_m)
         bodies.append(_body([(body, np.eye(4))], count, joint, T_palm @ _rounded(joint.T_parent_child)))
     return tuple(bodies)
 
@@ -127,7 +128,8 @@ def _body(
     kind = "prismatic" if joint is not None and joint.kind == "prismatic" else "revolute"
     return MovingBody(
         parent, name, kind, T_parent_child @ T_body_joint, T_body_joint, lower, upper_limit, tuple(parts),
-        max(mass, _LEAST_MASS_KG), T_body_principal, np.maximum(values, _LEAST_INERTIA_KGM2),
+        mass if parts else max(mass, _LEAST_MASS_KG), T_body_principal,
+        np.maximum(values, _LEAST_INERTIA_KGM2),
     )  # fmt: skip
 
 

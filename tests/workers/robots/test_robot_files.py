@@ -267,7 +267,10 @@ def test_a_hand_grasps_nothing_thinner_than_what_lies_between_its_closed_pads(ma
     assert len(thin.opening_m) == 0 and len(wide.opening_m) > 50
 
 
-def test_fingers_without_limits_and_with_names_of_the_arm_move_in_physics(make: Made) -> None:
+@pytest.mark.parametrize("given", ["", 'lower="0" upper="0.01" '])
+def test_fingers_with_names_of_the_arm_move_in_physics_as_far_as_the_file_says(
+    make: Made, given: str
+) -> None:
     pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
     from datagen.workers.trials.physics import TrialWorld
     from datagen.workers.trials.trial_scene import TrialScene, articulation_of
@@ -276,8 +279,11 @@ def test_fingers_without_limits_and_with_names_of_the_arm_move_in_physics(make: 
     name = make(
         ('tip = "palm"', 'tip = "wrist"'), more=f'[hand]\nurdf = "hand.urdf"\npalm = "palm"\n{ranges}'
     )
-    Path(name).with_name("hand.urdf").write_text(f"<robot name='h'>{HAND}</robot>")
+    hand = HAND.replace("0.1 0.006 0", "0.1 0.005 0").replace("0.1 -0.006 0", "0.1 -0.005 0")  # closed
+    hand = hand.replace("<limit ", f"<limit {given}")
+    Path(name).with_name("hand.urdf").write_text(f"<robot name='h'>{hand}</robot>")
     robot = open_robot(name, None, 0.85)
+    assert robot.gripper.linkage is None
     none = np.zeros((0, 3))
     things = (), none, none, (), np.zeros(0), np.zeros((0, 4, 4))
     scene = TrialScene(robot, articulation_of(robot), TrialParams(), 0.3, *things)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +15,10 @@ from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import translation, yaw_pose
 from datagen.workers.motion import MotionPlan
-from datagen.workers.robots import open_robot, robot_limits
+from datagen.workers.robots import open_robot, robot_limits, robot_source
+from datagen.workers.robots.resources import package_folders
+from datagen.workers.robots.robot import Robot
+from datagen.workers.robots.robot_file import RobotSource
 from datagen.workers.scenes import SettledScene
 from datagen.workers.trials import Disturbance, TrialResult
 from datagen.workers.trials.execute import run_trial
@@ -219,4 +224,17 @@ def test_every_robot_lifts_a_box(name: str, reach_m: float | None, distance_m: f
     # From the pregrasp on: the straight way there from a tucked pose may lead through the table.
     plan = dataclasses.replace(plan, q_reach_rad=plan.q_approach_rad[[0, 0]])
     result = run_trial(prepare_trials(scene, robot, PARAMS, 0.1), base, plan, Disturbance.none(0.6))
+    assert (result.outcome, result.lift_m) == ("success", pytest.approx(0.1, abs=0.005))
+
+
+def test_a_robot_whose_urdf_has_no_masses_lifts_a_box_as_one_with_masses(tmp_path: Path) -> None:
+    folder = next(package_folders("mani_skill")) / "assets/robots/panda"
+    (tmp_path / "franka_description").symlink_to(folder / "franka_description")
+    text = re.sub(r"<inertial>.*?</inertial>", "", (folder / "panda_v2.urdf").read_text(), flags=re.DOTALL)
+    (tmp_path / "panda.urdf").write_text(text)
+    keys = robot_source("panda").keys.model_copy(update={"urdf": str(tmp_path / "panda.urdf")})
+    robot = Robot(RobotSource(tmp_path / "robot.toml", keys)).at_height(0.8)
+    base = base_before(robot, 0.4)
+    plan = plan_from_above(robot, base, on_top_m(box(), 0.03), 0.07)
+    result = run_trial(prepare_trials(box(), robot, PARAMS, 0.1), base, plan, Disturbance.none(0.6))
     assert (result.outcome, result.lift_m) == ("success", pytest.approx(0.1, abs=0.005))
