@@ -128,7 +128,7 @@ def _body(
     kind = "prismatic" if joint is not None and joint.kind == "prismatic" else "revolute"
     return MovingBody(
         parent, name, kind, T_parent_child @ T_body_joint, T_body_joint, lower, upper_limit, tuple(parts),
-        mass if parts else max(mass, _LEAST_MASS_KG), T_body_principal,
+        0.0 if parts and not mass else max(mass, _LEAST_MASS_KG), T_body_principal,
         np.maximum(values, _LEAST_INERTIA_KGM2),
     )  # fmt: skip
 
