@@ -178,9 +178,9 @@ class JobRecorder:
         while asked is not None and not (stop.force if asked == "now" else stop.drain):
             stop.ask()
 
-    def seal(self) -> None:
-        """Publish that the shards are made and the store is being sealed."""
-        self._put(phase="sealing", in_flight=0)
+    def seal(self, totals: JobTotals) -> None:
+        """Publish that the shards are made, with the totals of the job, and the store is being sealed."""
+        self._put(phase="sealing", **_counts(totals) | {"in_flight": 0})
 
     def end(self, end: JobEnd, code: int, cause: str, summary: JobSummary | None = None) -> None:
         counts: dict[str, float] = {}

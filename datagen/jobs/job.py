@@ -26,6 +26,7 @@ from datagen.cluster.protocol import (
     JobTotals,
     ShardTask,
     StopRequest,
+    interrupted_by_sigterm,
     stop_on_signals,
 )
 from datagen.cluster.ray_cluster import RaySettings, refuse_unusable
@@ -115,7 +116,7 @@ class Job:
         Meanwhile the job publishes its state in the run, and polls it for stop requests. Raises InputError
         for an error that no retry can fix, and Interrupted where it was asked to stop.
         """
-        with resumable(self.resume):
+        with resumable(self.resume), interrupted_by_sigterm():
             result = self._run()
         if result.end == "interrupted":
             left = counted(result.remaining, "shard")
@@ -131,7 +132,7 @@ class Job:
         recorder = self.record(missing)
         try:
             summary = self._judged(self.make_missing(recorder, missing))
-            recorder.seal()
+            recorder.seal(summary.totals)
             result = self._finish(summary)
         except BaseException as error:
             end, code = _end_of(error)
