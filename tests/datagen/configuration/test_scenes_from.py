@@ -133,7 +133,8 @@ def test_a_viewpoint_needs_stored_scenes_with_these_labels(
 def test_more_than_the_source_has_is_refused_with_how_many_there_are(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out, words = tmp_path / "run", (f"--n: {N + 1}", f"is more than the {N} candidates")
+    fix = f"datagen resume {source} --n {N + PER_SCENE}"  # the source has all that it planned
+    out, words = tmp_path / "run", (f"--n: {N + 1}", f"is more than the {N} candidates", fix)
     refused(again_arguments(source, out, N + 1), capsys, *words)
     assert not out.exists()
     # A gap ends what can be used.
