@@ -161,11 +161,15 @@ class Job:
             shown = stack.enter_context(self.options.display())
             executor = self._executor(sum(map(len, missing)), stack, shown)
             stack.enter_context(stop_on_signals(stop, interrupt=self.options.workers == 0))
-            for job_run, shards in zip(self.runs, missing, strict=True):
+            sizes = [job_run.run.layout.samples_per_shard for job_run in self.runs]
+            labels = [len(shards) * size for shards, size in zip(missing, sizes, strict=True)]
+            for number, (job_run, shards) in enumerate(zip(self.runs, missing, strict=True), 1):
                 if whole.end in ("interrupted", "aborted"):
                     whole = replace(whole, totals=whole.totals.plus(JobTotals(len(shards))))
                 elif shards:
-                    whole = whole.plus(self._drive(job_run, shards, executor, recorder, stop, shown, notes))
+                    after = sum(labels[number:])
+                    done = self._drive(job_run, shards, executor, recorder, stop, shown, notes, after)
+                    whole = whole.plus(done)
                     recorder.add(whole.totals)
             whole = replace(whole, start_s=time.monotonic() - self.began_s - whole.elapsed_s)
         for job_run in self.runs:
@@ -182,6 +186,7 @@ class Job:
         stop: StopRequest,
         shown: Progress,
         notes: str,
+        labels_after: int,
     ) -> JobSummary:
         run = job_run.run
         layout, spec = run.layout, run.manifest.spec
@@ -203,7 +208,8 @@ class Job:
             _tell_compiling(shown)
         shown.phase("making labels")
         done = len(run.planned()) - len(shards)
-        events = JobMonitor(recorder, stop, shown, layout.samples_per_shard, done, notes, run.refuse_replaced)
+        per_shard, check = layout.samples_per_shard, run.refuse_replaced
+        events = JobMonitor(recorder, stop, shown, per_shard, done, notes, check, labels_after)
         policy = self.policy
         if run.storage.folder is None:  # attempts that wait for the store are not hung
             policy = replace(policy, min_deadline_s=policy.min_deadline_s + JOBS_WAIT_S)

@@ -14,6 +14,8 @@ import pytest
 import datagen.commands.resume
 import datagen.commands.submit
 from datagen import cli
+from datagen.cluster.job_monitor import JobMonitor
+from datagen.cluster.protocol import JobTotals
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.jobs.job import Job, JobOptions, JobRun
 from datagen.schemas.quarantine import lifted_records
@@ -103,6 +105,20 @@ def test_sigterm_while_the_store_is_sealed_ends_the_job_as_ctrl_c_does(
     assert (job["state"]["end"], job["state"]["exit_code"]) == ("interrupted", 130)
     assert cli.run(["resume", str(copied), *HERE]) == 0
     assert_equal_runs(arrays_of(copied), arrays_of(finished))
+
+
+def test_time_left_counts_the_labels_of_the_parts_to_come(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = [str(make_small_run(tmp_path / seed, PER_SCENE, "--seed", seed)) for seed in "12"]
+    assert cli.run(["merge", *parts, "--out", str(tmp_path / "merged")]) == 0
+    seen: list[JobMonitor] = []
+    init = JobMonitor.__init__
+    monkeypatch.setattr(JobMonitor, "__init__", lambda self, *given: seen.append(self) or init(self, *given))
+    assert cli.run(["resume", str(tmp_path / "merged"), "--n", str(6 * PER_SCENE), *HERE]) == 0
+    # Two parts of two new shards each: the first ends with the second to come, the second with none.
+    left = [monitor.left_s(JobTotals(2, committed=2, labels=2 * PER_SCENE)) for monitor in seen]
+    assert len(left) == 2 and left[0] is not None and left[0] > 0 and left[1] == 0
 
 
 @pytest.mark.parametrize(("option", "other"), [("--houses", "builtin:30"), ("--objects", "ycb:/nowhere")])
