@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from dataclasses import dataclass
 from typing import Any
@@ -148,7 +149,7 @@ def _job_events(storage: Storage) -> list[Event]:
     for job in Jobs(storage).all():
         record, state = job.record, job.state
         where = f"on {record.host}, process {record.pid}"
-        text = f"job {job.id} began {where}: {' '.join(record.command)}"
+        text = f"job {job.id} began {where}: {shlex.join(record.command)}"
         events.append(Event(record.started, "job_began", text))
         if state is not None and state.end:
             why = f": {state.cause}" if state.cause else ""
