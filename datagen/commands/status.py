@@ -115,7 +115,8 @@ def _seal(report: dict[str, Any]) -> str:
     if report["sealed_labels"] is None:
         return "no"
     outdated = f"{report['store']} is out of date ({report['sealed_labels']:,} labels)"
-    return f"{outdated}: `datagen verify --repair` seals it"
+    how = "resume" if report["shards"]["missing"] else "verify --repair"
+    return f"{outdated}: `datagen {how}` seals it"
 
 
 _GOOD = ("committed", "superseded")
