@@ -176,6 +176,19 @@ def test_a_robot_of_another_reach_is_refused_with_how_to_make_scenes_for_it(
     assert cli.run(again_arguments(fitting, tmp_path / "run", PER_SCENE, "--robot", "panda")) == 0
 
 
+def test_resume_says_how_to_name_scenes_that_have_moved(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, moved, out = (tmp_path / name for name in ("first", "moved", "run"))
+    shutil.copytree(source, first)
+    assert cli.run(again_arguments(first, out, PER_SCENE)) == 0
+    first.rename(moved)
+    words = ["resume", str(out), "--n", str(2 * PER_SCENE), "--workers", "0"]
+    refused(words, capsys, f"{out}/manifest.json: scenes_from", f"names {first}", "Give --scenes-from")
+    assert cli.run([*words, "--scenes-from", str(moved)]) == 0
+    assert len(arrays_of(out)["label"]) == 2 * PER_SCENE
+
+
 def test_objects_may_have_moved_but_not_changed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first, moved, other = (tmp_path / name for name in ("first", "moved", "other"))
     for folder, names in ((first, "abcdefgh"), (other, "bcdefghi")):
