@@ -17,6 +17,7 @@ from datagen.schemas.fields import Field
 from datagen.schemas.record_files import object_key
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import read_scenes
+from datagen.schemas.storage.errors import StoreUnavailable
 from datagen.workers.engine_versions import label_engines, scene_engines
 from datagen.workers.run_shard import run_shard
 from datagen.workers.world import World, open_world
@@ -48,7 +49,13 @@ def source_of(run: Run, given: Sources = AS_FOUND) -> Run:
     fix = "Give --scenes-from with the run that this one was started with"
     if not path:
         raise InputError(run.storage.url, "scenes_from", "is not in the run's manifest", fix)
-    source = Run.open(path)
+    try:
+        source = Run.open(path)
+    except InputError as error:
+        if given.scenes_from is not None or isinstance(error, StoreUnavailable):
+            raise
+        problem = f"names {error.place} for the scenes, which cannot be opened ({error.problem})"
+        raise InputError(f"{run.storage.url}/manifest.json", "scenes_from", problem, fix) from error
     stored = run.manifest.spec.scenes_from
     if stored is None or source.manifest.spec.scenes_hash != stored.spec_hash:
         raise InputError(path, "spec_hash", "has other scenes than this run", fix)

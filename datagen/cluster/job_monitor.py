@@ -25,13 +25,20 @@ NOTES_S = 1.0  # between two looks at the progress of running attempts
 class JobProgress:
     """A driver's events, shown: shards done, rate, time left, retries, quarantined shards, cost so far.
 
-    `done_before` counts the shards of earlier jobs. Rate and time left include the labels of unfinished
-    shards on this machine, from the job's notes.
+    `done_before` counts the shards of earlier jobs, `labels_after` the labels of runs that the job makes
+    later. Rate and time left include the labels of unfinished shards on this machine, from the job's notes.
     """
 
-    def __init__(self, shown: Progress, labels_per_shard: int, done_before: int = 0, notes: str = "") -> None:
+    def __init__(
+        self,
+        shown: Progress,
+        labels_per_shard: int,
+        done_before: int = 0,
+        notes: str = "",
+        labels_after: int = 0,
+    ) -> None:
         self._shown, self._pace, self._labels_per_shard = shown, Pace(shown.clock), labels_per_shard
-        self._done_before, self._reason = done_before, ""
+        self._done_before, self._labels_after, self._reason = done_before, labels_after, ""
         self._notes, self._running, self._next_note_s = notes, Running(), float("-inf")
 
     def ended(self, report: AttemptReport, action: str) -> None:
@@ -54,8 +61,8 @@ class JobProgress:
         self._shown.say("stopping", {"reason": reason}, text, "yellow")
 
     def left_s(self, totals: JobTotals) -> float | None:
-        """Seconds until the last shard at the rate of the last minute; None while it is unknown."""
-        more = (totals.shards - totals.finished) * self._labels_per_shard
+        """Seconds until the job's last shard at the rate of the last minute; None while it is unknown."""
+        more = (totals.shards - totals.finished) * self._labels_per_shard + self._labels_after
         return self._pace.left_s(more - self._in_flight(totals))
 
     def _in_flight(self, totals: JobTotals) -> int:
@@ -111,8 +118,9 @@ class JobMonitor(JobProgress):
         done_before: int = 0,
         notes: str = "",
         check: Callable[[], None] = lambda: None,
+        labels_after: int = 0,
     ) -> None:
-        super().__init__(shown, labels_per_shard, done_before, notes)
+        super().__init__(shown, labels_per_shard, done_before, notes, labels_after)
         self._check = check
         self._recorder, self._stop, self._clock = recorder, stop, shown.clock
         self._next_beat_s = self._next_look_s = self._clock()
@@ -178,9 +186,9 @@ class JobRecorder:
         while asked is not None and not (stop.force if asked == "now" else stop.drain):
             stop.ask()
 
-    def seal(self) -> None:
-        """Publish that the shards are made and the store is being sealed."""
-        self._put(phase="sealing", in_flight=0)
+    def seal(self, totals: JobTotals) -> None:
+        """Publish that the shards are made, with the totals of the job, and the store is being sealed."""
+        self._put(phase="sealing", **_counts(totals) | {"in_flight": 0})
 
     def end(self, end: JobEnd, code: int, cause: str, summary: JobSummary | None = None) -> None:
         counts: dict[str, float] = {}

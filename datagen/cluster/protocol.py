@@ -221,6 +221,19 @@ class StopRequest:
 
 
 @contextmanager
+def interrupted_by_sigterm() -> Generator[None]:
+    """Make SIGTERM raise KeyboardInterrupt within the block, as Ctrl-C does; the handler is restored."""
+    if current_thread() is not main_thread():  # Python lets the main thread alone handle signals
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
 def stop_on_signals(stop: StopRequest, interrupt: bool = False) -> Generator[StopRequest]:
     """Make Ctrl-C and SIGTERM stop requests within the block; the handlers are restored after it.
 

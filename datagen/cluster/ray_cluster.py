@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import socket
 import sys
 import threading
@@ -74,6 +75,7 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
     the running one cannot be reached or requires another token.
     """
     local = settings.address == "local"
+    on_sigterm = signal.getsignal(signal.SIGTERM)
     with ExitStack() as whole, ExitStack() as start:
         if local:
             address, folder = "local", whole.enter_context(private_folder())
@@ -112,6 +114,8 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
         yield ray
     if local:  # without its servers, which are killed now, Ray ends
         ending.join(_END_WITHIN_S)
+    if on_sigterm is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, on_sigterm)  # Ray removes it when it ends
 
 
 def _end(ending: threading.Thread, tell: Callable[[str], None]) -> None:
@@ -248,10 +252,13 @@ def _refuses(address: str, token: str | None) -> bool:
 def _keep_ray_local() -> None:
     """Make Ray use 127.0.0.1 instead of this machine's external address, and upload no code under `uv run`.
 
-    Private: Ray reads both from the environment, but only when it is imported, which may have been before.
+    And leave SIGTERM to the job, which ends with its message; Ray would exit with the signal's number.
+    Private: Ray reads the first two from the environment, but only when it is imported, which may have been
+    before.
     """
-    from ray._private import ray_constants
+    from ray._private import ray_constants, utils
 
+    utils.set_sigterm_handler = lambda sigterm_handler: None
     ray_constants.ENABLE_RAY_CLUSTER = False
     ray_constants.RAY_ENABLE_UV_RUN_RUNTIME_ENV = False
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from dataclasses import dataclass
 from typing import Any
@@ -114,7 +115,8 @@ def _seal(report: dict[str, Any]) -> str:
     if report["sealed_labels"] is None:
         return "no"
     outdated = f"{report['store']} is out of date ({report['sealed_labels']:,} labels)"
-    return f"{outdated}: `datagen verify --repair` seals it"
+    how = "resume" if report["shards"]["missing"] else "verify --repair"
+    return f"{outdated}: `datagen {how}` seals it"
 
 
 _GOOD = ("committed", "superseded")
@@ -148,7 +150,7 @@ def _job_events(storage: Storage) -> list[Event]:
     for job in Jobs(storage).all():
         record, state = job.record, job.state
         where = f"on {record.host}, process {record.pid}"
-        text = f"job {job.id} began {where}: {' '.join(record.command)}"
+        text = f"job {job.id} began {where}: {shlex.join(record.command)}"
         events.append(Event(record.started, "job_began", text))
         if state is not None and state.end:
             why = f": {state.cause}" if state.cause else ""

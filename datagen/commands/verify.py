@@ -67,14 +67,14 @@ def verify(
             found.take(repaired.left)
         else:
             found.take(check_runs(storage, checked, seen))
-    replayed = min(replay, checked.samples) if not found.damage else 0
-    if replayed:
-        _replay(storage, checked, found, replay, given, json)
+    scenes = 0
+    if replay and checked.samples and not found.damage:
+        scenes = _replay(storage, checked, found, replay, given, json)
     if clean:
         with counting("shards searched", as_json=json) as seen:
             cleaned = clean_runs(storage, seen)
     report = _report(run, checked, found, repaired, cleaned)
-    report["replay"] = {"asked": replay, "done": bool(replayed)} if replay else None
+    report["replay"] = {"asked": replay, "scenes": scenes, "done": scenes > 0} if replay else None
     if json:
         print_json(report)
     else:
@@ -95,15 +95,24 @@ def _verify_export(storage: Storage, record: ExportRecord, json: bool) -> int:
 
 def _replay(
     storage: Storage, checked: Checked, found: _Found, count: int, given: AssetSources, json: bool
-) -> None:
+) -> int:
+    """Add the findings of `count` scenes, or of all if there are fewer; return how many were made again."""
     # Simulators are imported only for --replay.
     from datagen.replaying import replay_findings
 
     sources = Sources(houses=given.houses, objects=given.objects, robot=given.robot)
+    done = 0
     with counting("scenes made again", as_json=json) as seen:
-        for run, finding in replay_findings(checked.runs, count, sources, seen):
+
+        def count_scene(number: int, of: int) -> None:
+            nonlocal done
+            done = number
+            seen(number, of)
+
+        for run, finding in replay_findings(checked.runs, count, sources, count_scene):
             folder = run.storage.url.removeprefix(storage.url).strip("/")
             found.take([replace(finding, key=f"{folder}/{finding.key}".strip("/"))])
+    return done
 
 
 class _Found:
@@ -189,7 +198,7 @@ def _print(report: dict[str, Any], checked: Checked, found: _Found, repaired: Re
             again = command_line(["resume", report["run"]])
             rows.append(("", f"now in {repaired.into}; to make shards again: {again}"))
     if (replay := report["replay"]) is not None:
-        done = f"{counted(replay['asked'], 'scene')} made again and compared bit for bit"
+        done = f"{counted(replay['scenes'], 'scene')} made again and compared bit for bit"
         rows.append(("replay", done if replay["done"] else "not done: repair the run first"))
     if (removed := report["removed"]) is not None:
         rows.append(("removed", f"{counted(removed['files'], 'leftover file')}, {size(removed['bytes'])}"))

@@ -139,12 +139,14 @@ def layout_again(spec: Specification, stored: StoredScenes, n: int) -> Layout:
 def refuse_too_few(stored: StoredScenes, layout: Layout, n: int) -> None:
     """Raise InputError where n labels in shards of this layout need more scenes than there are."""
     shards = stored.available() // layout.samples_per_shard
-    if layout.shards_for(n) > shards:
+    if (needed := layout.shards_for(n)) > shards:
+        wanted = needed * layout.samples_per_shard
+        grown = f" --n {wanted}" if wanted > stored.run.n else ""
         raise InputError(
             "--n",
             str(n),
             f"is more than the {shards * layout.samples_per_shard:,} candidates of {stored.run.storage.url}",
-            f"Ask for fewer labels, or extend that run first: {stored.run.command_for_missing}",
+            f"Ask for fewer labels, or extend that run first: {stored.run.command_for_missing}{grown}",
         )
 
 

@@ -78,9 +78,9 @@ def summary_of_stored() -> Generator[None]:
 
 
 def new_labels(made: int, wanted: int) -> str:
-    """The labels that a job made; a run's last shard may hold more than the store."""
+    """The labels that a job made; a run's last shard may hold more than are read."""
     if made > wanted:
-        return f"{made:,} new in whole shards; the store has the {wanted:,} wanted"
+        return f"{made:,} new in whole shards; readers get the {wanted:,} wanted"
     return f"{made:,} new of {wanted:,} wanted"
 
 

@@ -26,6 +26,7 @@ from datagen.cluster.protocol import (
     JobTotals,
     ShardTask,
     StopRequest,
+    interrupted_by_sigterm,
     stop_on_signals,
 )
 from datagen.cluster.ray_cluster import RaySettings, refuse_unusable
@@ -115,7 +116,7 @@ class Job:
         Meanwhile the job publishes its state in the run, and polls it for stop requests. Raises InputError
         for an error that no retry can fix, and Interrupted where it was asked to stop.
         """
-        with resumable(self.resume):
+        with resumable(self.resume), interrupted_by_sigterm():
             result = self._run()
         if result.end == "interrupted":
             left = counted(result.remaining, "shard")
@@ -131,7 +132,7 @@ class Job:
         recorder = self.record(missing)
         try:
             summary = self._judged(self.make_missing(recorder, missing))
-            recorder.seal()
+            recorder.seal(summary.totals)
             result = self._finish(summary)
         except BaseException as error:
             end, code = _end_of(error)
@@ -160,11 +161,15 @@ class Job:
             shown = stack.enter_context(self.options.display())
             executor = self._executor(sum(map(len, missing)), stack, shown)
             stack.enter_context(stop_on_signals(stop, interrupt=self.options.workers == 0))
-            for job_run, shards in zip(self.runs, missing, strict=True):
+            sizes = [job_run.run.layout.samples_per_shard for job_run in self.runs]
+            labels = [len(shards) * size for shards, size in zip(missing, sizes, strict=True)]
+            for number, (job_run, shards) in enumerate(zip(self.runs, missing, strict=True), 1):
                 if whole.end in ("interrupted", "aborted"):
                     whole = replace(whole, totals=whole.totals.plus(JobTotals(len(shards))))
                 elif shards:
-                    whole = whole.plus(self._drive(job_run, shards, executor, recorder, stop, shown, notes))
+                    after = sum(labels[number:])
+                    done = self._drive(job_run, shards, executor, recorder, stop, shown, notes, after)
+                    whole = whole.plus(done)
                     recorder.add(whole.totals)
             whole = replace(whole, start_s=time.monotonic() - self.began_s - whole.elapsed_s)
         for job_run in self.runs:
@@ -181,6 +186,7 @@ class Job:
         stop: StopRequest,
         shown: Progress,
         notes: str,
+        labels_after: int,
     ) -> JobSummary:
         run = job_run.run
         layout, spec = run.layout, run.manifest.spec
@@ -202,7 +208,8 @@ class Job:
             _tell_compiling(shown)
         shown.phase("making labels")
         done = len(run.planned()) - len(shards)
-        events = JobMonitor(recorder, stop, shown, layout.samples_per_shard, done, notes, run.refuse_replaced)
+        per_shard, check = layout.samples_per_shard, run.refuse_replaced
+        events = JobMonitor(recorder, stop, shown, per_shard, done, notes, check, labels_after)
         policy = self.policy
         if run.storage.folder is None:  # attempts that wait for the store are not hung
             policy = replace(policy, min_deadline_s=policy.min_deadline_s + JOBS_WAIT_S)

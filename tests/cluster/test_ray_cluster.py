@@ -95,6 +95,21 @@ def test_a_cluster_of_this_machine_has_a_token_of_its_own() -> None:
     assert new_token() != new_token()
 
 
+def test_sigterm_keeps_its_handler_while_a_cluster_runs_and_after_it() -> None:
+    came: list[str] = []
+    when = ""
+    before = signal.signal(signal.SIGTERM, lambda number, frame: came.append(when))
+    try:
+        with ray_cluster(RaySettings(workers=1)):
+            when = "in it"
+            os.kill(os.getpid(), signal.SIGTERM)
+        when = "after it"
+        os.kill(os.getpid(), signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert came == ["in it", "after it"]
+
+
 ANOTHER_USER = """
 from pathlib import Path
 import grpc, grpc._channel

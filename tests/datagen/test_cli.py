@@ -220,7 +220,7 @@ def test_a_machine_without_loopback_is_refused_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("extra", [0, 4])
-def test_a_job_says_how_many_labels_it_made_and_how_many_the_store_has(
+def test_a_job_says_how_many_labels_it_made_and_how_many_count(
     extra: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     n = 2 * PER_SCENE - extra
@@ -232,7 +232,7 @@ def test_a_job_says_how_many_labels_it_made_and_how_many_the_store_has(
     shown = capsys.readouterr().out
     stored = arrays_of(tmp_path / "other")["label"].shape[0]
     assert stored == n
-    wanted = "16 new in whole shards; the store has the 12 wanted" if extra else "16 new of 16 wanted"
+    wanted = "16 new in whole shards; readers get the 12 wanted" if extra else "16 new of 16 wanted"
     assert wanted in shown
     assert cli.run(["status", str(tmp_path / "run")]) == 0
     assert "run run" not in capsys.readouterr().out.replace(str(tmp_path) + "/", "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,15 @@ def test_a_working_folder_that_is_not_utf8_is_refused_where_a_record_would_name_
     assert cli.run(outside) == 0  # nothing names the folder
     (job,) = Jobs(open_storage(tmp_path / "run")).all()
     assert job.state is not None and job.state.end == "complete"
+
+
+def test_the_log_has_a_command_that_can_be_copied(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "Büro's 2"
+    assert cli.run(submit_arguments(run, 8)) == 0
+    capsys.readouterr()
+    assert cli.run(["status", str(run), "--log"]) == 0
+    began = capsys.readouterr().out.splitlines()[0]
+    assert str(run) in shlex.split(began.partition(": ")[2])
 
 
 def test_a_record_of_half_characters_can_be_read_back(odd: Path) -> None:

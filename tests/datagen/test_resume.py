@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shlex
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,12 +14,15 @@ import pytest
 import datagen.commands.resume
 import datagen.commands.submit
 from datagen import cli
+from datagen.cluster.job_monitor import JobMonitor
+from datagen.cluster.protocol import JobTotals
 from datagen.cluster.shard_policy import RetryPolicy
 from datagen.jobs.job import Job, JobOptions, JobRun
 from datagen.schemas.quarantine import lifted_records
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.run import Run, open_runs
 from datagen.schemas.run_records import Manifest
+from tests.conftest import REPOSITORY
 from tests.made_runs import give_up, lose
 from tests.refusals import refused
 from tests.small_runs import (
@@ -62,6 +67,58 @@ def test_merged_runs_are_resumed_part_by_part(finished: Path, copied: Path, tmp_
     assert [list(run.missing()) for run in open_runs(place)] == [[], []]
     assert cli.run(["merge", str(finished), str(whole), "--out", str(tmp_path / "again")]) == 0
     assert_equal_runs(arrays_of(place), arrays_of(tmp_path / "again"))
+
+
+# `datagen`, which gets SIGTERM while it writes the sealed store, and prints its state first.
+TERMINATED = """
+import os, signal, sys
+from pathlib import Path
+from datagen import cli
+from datagen.schemas import sealing
+write, run = sealing._write, Path(sys.argv[2])
+def terminated(*given):
+    for number, entry in enumerate(write(*given)):
+        if number == 3:
+            (state,) = run.glob("jobs/*.state.json")
+            print(state.read_text())
+            os.kill(os.getpid(), signal.SIGTERM)
+        yield entry
+sealing._write = terminated
+sys.exit(cli.run(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("workers", ["0", "1"])
+def test_sigterm_while_the_store_is_sealed_ends_the_job_as_ctrl_c_does(
+    finished: Path, copied: Path, workers: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lose(copied, 2, 5)
+    for left in (*copied.glob("data*.claim"), copied / "data.json", *copied.glob("jobs/*")):
+        left.unlink()
+    shutil.rmtree(copied / "data.zarr")
+    words = [sys.executable, "-c", TERMINATED, "resume", str(copied), "--workers", workers]
+    done = subprocess.run(words, cwd=REPOSITORY, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 130 and f"datagen resume {copied} --workers {workers}" in done.stderr
+    assert '"phase": "sealing"' in done.stdout and '"done": 2,' in done.stdout
+    assert not list(copied.glob("data*"))
+    (job,) = json_of(capsys, ["status", str(copied)])["jobs"]
+    assert (job["state"]["end"], job["state"]["exit_code"]) == ("interrupted", 130)
+    assert cli.run(["resume", str(copied), *HERE]) == 0
+    assert_equal_runs(arrays_of(copied), arrays_of(finished))
+
+
+def test_time_left_counts_the_labels_of_the_parts_to_come(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = [str(make_small_run(tmp_path / seed, PER_SCENE, "--seed", seed)) for seed in "12"]
+    assert cli.run(["merge", *parts, "--out", str(tmp_path / "merged")]) == 0
+    seen: list[JobMonitor] = []
+    init = JobMonitor.__init__
+    monkeypatch.setattr(JobMonitor, "__init__", lambda self, *given: seen.append(self) or init(self, *given))
+    assert cli.run(["resume", str(tmp_path / "merged"), "--n", str(6 * PER_SCENE), *HERE]) == 0
+    # Two parts of two new shards each: the first ends with the second to come, the second with none.
+    left = [monitor.left_s(JobTotals(2, committed=2, labels=2 * PER_SCENE)) for monitor in seen]
+    assert len(left) == 2 and left[0] is not None and left[0] > 0 and left[1] == 0
 
 
 @pytest.mark.parametrize(("option", "other"), [("--houses", "builtin:30"), ("--objects", "ycb:/nowhere")])

@@ -12,7 +12,8 @@ from datagen import cli
 from datagen.schemas.quarantine import lift_quarantine
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import LedgerEntry, Outcome
-from tests.made_runs import give_up, make_run
+from datagen.schemas.sealing import seal
+from tests.made_runs import attempt, give_up, make_run
 from tests.small_runs import json_of
 
 SEGFAULT = "Fatal Python error: Segmentation fault"
@@ -119,3 +120,16 @@ def test_a_lifted_quarantine_stays_in_the_log(tmp_path: Path, capsys: pytest.Cap
     assert lift_quarantine(run) == [1]
     (event,) = lines_of(capsys, run.storage.url)
     assert event["event"] == "quarantined" and "tried again later" in event["text"]
+
+
+def test_status_names_what_seals_a_store_that_is_out_of_date(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = make_run(tmp_path / "run", n=20)
+    seal(run.storage)
+    run.grow(40)
+    for shards, verb in (((), "resume"), (run.missing(), "verify --repair")):
+        for shard in shards:
+            assert attempt(run, shard, f"later-{shard}")
+        assert cli.run(["status", run.storage.url]) == 0
+        assert f"`datagen {verb}` seals it" in capsys.readouterr().out

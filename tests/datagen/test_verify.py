@@ -38,7 +38,9 @@ def test_a_finished_run_is_clean_and_its_scenes_are_made_again(
     report = verified(finished, capsys, 0, "--replay", "9")
     assert (report["clean"], report["findings"], report["sealed"]) == (True, [], True)
     assert report["shards_of_other_code"] == 0
-    assert report["replay"] == {"asked": 9, "done": True}
+    assert report["replay"] == {"asked": 9, "scenes": 3, "done": True}
+    assert cli.run(["verify", str(finished), "--replay", "9"]) == 0
+    assert "3 scenes made again" in capsys.readouterr().out  # the run has no more
     assert report["samples"] == 3 * PER_SCENE
     ledger = report["ledger"]
     assert ledger["wall_s"] == ledger["commits_wall_s"] + ledger["waste_wall_s"] > 0

@@ -133,7 +133,8 @@ def test_a_viewpoint_needs_stored_scenes_with_these_labels(
 def test_more_than_the_source_has_is_refused_with_how_many_there_are(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out, words = tmp_path / "run", (f"--n: {N + 1}", f"is more than the {N} candidates")
+    fix = f"datagen resume {source} --n {N + PER_SCENE}"  # the source has all that it planned
+    out, words = tmp_path / "run", (f"--n: {N + 1}", f"is more than the {N} candidates", fix)
     refused(again_arguments(source, out, N + 1), capsys, *words)
     assert not out.exists()
     # A gap ends what can be used.
@@ -173,6 +174,19 @@ def test_a_robot_of_another_reach_is_refused_with_how_to_make_scenes_for_it(
     refused(arguments, capsys, str(source), "arm_reach_m", "submit heuristic --robot panda")
     fitting = make_small_run(tmp_path / "fitting", PER_SCENE, "--robot", "panda")
     assert cli.run(again_arguments(fitting, tmp_path / "run", PER_SCENE, "--robot", "panda")) == 0
+
+
+def test_resume_says_how_to_name_scenes_that_have_moved(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, moved, out = (tmp_path / name for name in ("first", "moved", "run"))
+    shutil.copytree(source, first)
+    assert cli.run(again_arguments(first, out, PER_SCENE)) == 0
+    first.rename(moved)
+    words = ["resume", str(out), "--n", str(2 * PER_SCENE), "--workers", "0"]
+    refused(words, capsys, f"{out}/manifest.json: scenes_from", f"names {first}", "Give --scenes-from")
+    assert cli.run([*words, "--scenes-from", str(moved)]) == 0
+    assert len(arrays_of(out)["label"]) == 2 * PER_SCENE
 
 
 def test_objects_may_have_moved_but_not_changed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
