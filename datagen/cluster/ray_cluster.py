@@ -106,6 +106,7 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
         except (OSError, RuntimeError, ValueError, AuthenticationError, RaySystemError) as error:
             raise _refusal(settings.address, error) from error
         start.close()
+        _handle_sigterm(on_sigterm)  # else Ray's machine code takes it for a crash, and aborts
         # Private: Ray prints a paragraph for each dead worker; the driver reports it already.
         ray._private.worker._worker_logs_enabled = False  # pyright: ignore
         ray._private.worker._unhandled_error_handler = lambda error: None  # pyright: ignore
@@ -114,8 +115,12 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
         yield ray
     if local:  # without its servers, which are killed now, Ray ends
         ending.join(_END_WITHIN_S)
-    if on_sigterm is not None and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, on_sigterm)  # Ray removes it when it ends
+    _handle_sigterm(on_sigterm)  # Ray removes it when it ends
+
+
+def _handle_sigterm(handler: Any) -> None:
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
 
 
 def _end(ending: threading.Thread, tell: Callable[[str], None]) -> None:
