@@ -103,9 +103,7 @@ def test_sigterm_keeps_its_handler_while_a_cluster_runs_and_after_it() -> None:
         with ray_cluster(RaySettings(workers=1)):
             when = "in it"
             os.kill(os.getpid(), signal.SIGTERM)
-            assert not any(
-                signal.getitimer(signal.ITIMER_REAL)
-            )  # with which Ray aborts a process
+            assert not any(signal.getitimer(signal.ITIMER_REAL))  # with which Ray aborts a process
         when = "after it"
         os.kill(os.getpid(), signal.SIGTERM)
     finally:
