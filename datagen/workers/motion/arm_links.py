@@ -58,9 +58,7 @@ def arm_links(name: str) -> ArmLinks:
     arm = pose_reach(name, reach_m)
     parts = b"-".join(np.asarray(part).tobytes() for part in (*tree, radius_m, *arm))
     key = f"{sha256(parts).hexdigest()}-{version_of('numpy')}"
-    if (stored := _CACHE.load(key)) is None:
-        _CACHE.store(key, stored := _sampled(tree, radius_m, arm)._asdict())
-    return ArmLinks(**stored)
+    return ArmLinks(**_CACHE.computed(key, lambda: _sampled(tree, radius_m, arm)._asdict()))
 
 
 def _sampled(tree: KinematicTree, radius_m: F64, arm: PoseReach) -> ArmLinks:

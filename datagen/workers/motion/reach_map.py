@@ -231,10 +231,8 @@ def reach_map(tree: KinematicTree, draw: int = 0) -> ReachMap:
     key = (*(a.tobytes() for a in one), turn, draw)
     if key not in _known:
         kept = sha256(repr((code_folder().name, np.__version__, _SAMPLES, _FIRST_SAMPLES, key)).encode())
-        stored = _MAPS.load(kept.hexdigest())
-        if stored is None:
-            stored = _samples(one, turn, _rounded(axis_xy_m / length_m), draw)
-            _MAPS.store(kept.hexdigest(), stored)
+        axis_xy = _rounded(axis_xy_m / length_m)
+        stored = _MAPS.computed(kept.hexdigest(), lambda: _samples(one, turn, axis_xy, draw))
         count = DISTANCES * HEIGHTS * DIRECTIONS * ROLLS * (1 if turn >= 0 else AZIMUTHS)
         first = np.append(0, np.cumsum(np.bincount(stored["cell"], minlength=count))).astype(np.int32)
         _known[key] = first, stored["q"], float(stored["half"]), _near(first)

@@ -44,8 +44,7 @@ def largest_reach_m(chain: Chain) -> float:
 def _largest_reach_m(*parts: bytes) -> float:
     """That of a chain's arrays, computed once on a machine."""
     key = f"{sha256(b'-'.join(parts)).hexdigest()}-{version_of('numpy')}"
-    if (stored := _REACHES.load(key)) is None:
-        _REACHES.store(key, stored := {"reach_m": np.array(_ascended_m(*parts))})
+    stored = _REACHES.computed(key, lambda: {"reach_m": np.array(_ascended_m(*parts))})
     return float(stored["reach_m"])
 
 
