@@ -184,15 +184,14 @@ def prepare_trials(
 
     `base_radius_m` is that of the pedestal, for robots without a base of their own.
     """
-    still = tuple(part for body in scene.house.house.bodies for part in body.convex_parts_m)
-    low = np.array([part.min(axis=0) for part in still], np.float64).reshape(-1, 3)
-    high = np.array([part.max(axis=0) for part in still], np.float64).reshape(-1, 3)
+    house = scene.house.house
+    low, high = (corners_m.astype(np.float64) for corners_m in house.part_boxes_m)
     return TrialScene(
         robot=robot,
         articulation=articulation_of(robot),
         params=params,
         base_radius_m=base_radius_m,
-        still_parts_m=still,
+        still_parts_m=tuple(house.parts_m),
         still_low_m=low,
         still_high_m=high,
         parts_m=tuple(merge_parts(model.convex_parts_m, params.hulls_per_object) for model in scene.models),
