@@ -37,6 +37,17 @@ def _right_turns_cut(points: list[tuple[float, float]]) -> list[tuple[float, flo
     return chain[:-1]
 
 
+def unit_circle(corners: int, first: float = 0.0) -> F64:
+    """Corners (K, 2) of a regular polygon in the unit circle, counter-clockwise from `first` steps off x."""
+    angle = 2 * np.pi * (np.arange(corners) + first) / corners
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def prism_corners(outline_m: F64, low_m: float, high_m: float) -> F64:
+    """Corners (2 K, 3) of an upright prism over an outline (K, 2), the lower ones first."""
+    return np.concatenate([np.column_stack([outline_m, np.full(len(outline_m), z)]) for z in (low_m, high_m)])
+
+
 def stack_polygons(polygons_m: Sequence[F64]) -> F64:
     """Polygons of different length as one array (P, K, 2), padded by repeating the last corner."""
     longest = max((len(p) for p in polygons_m), default=1)

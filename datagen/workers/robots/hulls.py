@@ -23,6 +23,7 @@ from datagen.schemas.safe_files import read_regular
 from datagen.workers.content_cache import CacheFolder, version_of
 from datagen.workers.extras import how_to_get
 from datagen.workers.geometry.mesh import F32, F64, I32
+from datagen.workers.geometry.planar import prism_corners, unit_circle
 from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.urdf import MOST, Shape
 
@@ -41,7 +42,7 @@ _TAKEN_AT_ONCE = 4
 _PUSHES = 50
 _TOUCHING_M = 1e-6
 _MOST_FACES, _SHEET_M, _FLAT_M, _LARGEST_M = 500_000, 0.0005, 5e-7, 20.0
-_RING = np.stack([f(2 * np.pi * (np.arange(16) + 0.5) / 16) for f in (np.cos, np.sin)], axis=1)
+_RING = unit_circle(16, 0.5)
 # Faces, edges and corners of a cube.
 _DIRECTIONS = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 _DIRECTIONS = _DIRECTIONS[np.abs(_DIRECTIONS).sum(axis=1) > 0]
@@ -94,9 +95,7 @@ def _solid(size_m: F64) -> F64:
     if len(size_m) == 1:
         return _BALL * size_m[0]
     ring = _RING * (size_m[0] / np.cos(np.pi / len(_RING)))
-    return np.concatenate(
-        [np.column_stack([ring, np.full(len(ring), z)]) for z in size_m[1] / 2 * np.array([-1, 1])]
-    )
+    return prism_corners(ring, -size_m[1] / 2, size_m[1] / 2)
 
 
 @lru_cache(maxsize=512)

@@ -9,6 +9,7 @@ import numpy as np
 
 from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.planar import prism_corners, unit_circle
 from datagen.workers.geometry.transforms import translation
 from datagen.workers.objects.part_merging import merge_parts
 from datagen.workers.robots.links import LinkBody
@@ -214,12 +215,8 @@ def pedestal_below(prepared: TrialScene, T_world_base: F64) -> F32 | None:
     if prepared.robot.base_radius_m is not None:
         return None
     x, y, z = T_world_base[:3, 3]
-    angles = 2 * np.pi * np.arange(_PEDESTAL_SIDES) / _PEDESTAL_SIDES
-    ring = np.array([x, y]) + prepared.base_radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    levels = (0.0, z - _PEDESTAL_GAP_M)
-    return np.concatenate([np.c_[ring, np.full(_PEDESTAL_SIDES, level)] for level in levels]).astype(
-        np.float32
-    )
+    ring = np.array([x, y]) + prepared.base_radius_m * unit_circle(_PEDESTAL_SIDES)
+    return prism_corners(ring, 0.0, z - _PEDESTAL_GAP_M).astype(np.float32)
 
 
 def disturbed(prepared: TrialScene, disturbance: Disturbance) -> TrialScene:
