@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw
 
 from datagen.drawing.film import View, font_of, no_house
 from datagen.drawing.posed_robot import RobotBodies, robot_bodies
-from datagen.workers.geometry.mesh import F64, Mesh
+from datagen.workers.geometry.mesh import F64, Mesh, transformed
 from datagen.workers.geometry.transforms import inverse, translation
 from datagen.workers.rendering.embree import RayMesh, RayScene, ray_mesh
 from datagen.workers.robots.hulls import hull_faces
@@ -71,7 +71,7 @@ def _picture(eye_m: F64, points_m: F64, rays: list[RayMesh], T: list[F64]) -> Im
 
 def _points(bodies: RobotBodies, T: F64, rows: list[int] | None = None) -> F64:
     chosen = range(len(bodies.rays)) if rows is None else rows
-    return np.concatenate([bodies.rays[k].mesh.vertices_m @ T[k, :3, :3].T + T[k, :3, 3] for k in chosen])
+    return np.concatenate([transformed(bodies.rays[k].mesh.vertices_m, T[k]) for k in chosen])
 
 
 def _floor(robot: Robot) -> list[Mesh]:

@@ -25,7 +25,7 @@ from datagen.schemas.identity import digest_of
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.furniture.asset_geometry import type_of_name
 from datagen.workers.furniture.assets import CARRYING_TYPES
-from datagen.workers.geometry.mesh import F32, F64, Mesh, MeshFile
+from datagen.workers.geometry.mesh import F32, F64, Mesh, MeshFile, transformed_parts
 from datagen.workers.geometry.transforms import rotation_of
 from datagen.workers.houses.glb import read_glb
 from datagen.workers.houses.habitat_checks import (
@@ -222,7 +222,7 @@ class HabitatHouses:
     ) -> tuple[StaticBody, F64, F64, Mesh]:
         """The body, the point that decides its room, its pose and its mesh in its own frame."""
         mesh = template.mesh.transformed(T)
-        parts = tuple((p @ T[:3, :3].T + T[:3, 3]).astype(np.float32) for p in template.parts_m)
+        parts = transformed_parts(template.parts_m, T)
         size_m = np.ptp(mesh.vertices_m, axis=0)
         object_type = self._type_of(name, files)
         is_small = bool(size_m.max() < _SMALL_M or (mesh.vertices_m[:, 2].min() > 0.2 and size_m.max() < 0.6))

@@ -12,7 +12,7 @@ import numpy as np
 from datagen.schemas.specification import MotionParams
 from datagen.workers.bases.clearance import STEP_M
 from datagen.workers.content_cache import CacheFolder
-from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.mesh import F32, F64, transformed
 from datagen.workers.grasps.grasp_cache import GraspSet, content_digest, file_digest
 from datagen.workers.kinematics.compiler import code_folder, in_memory
 from datagen.workers.kinematics.contacts import Parts, Still, hit_any, parts_of
@@ -140,7 +140,8 @@ def hand_scene(
     """
     target, T_world_target = scene.models[0], scene.T_world_object[0]
     static, floor = _static_around(scene, around_m)
-    objects = [_placed(m, T) for m, T in zip(scene.models, scene.T_world_object, strict=True)]
+    bodies = zip(scene.models, scene.T_world_object, strict=True)
+    objects = [[transformed(part, T) for part in model.convex_parts_m] for model, T in bodies]
     others = [part for parts in objects[1:] for part in parts]
     kinds = [int(FLOOR if f else OTHER) for f in floor]
     kinds += [int(TARGET)] * len(objects[0]) + [int(OTHER)] * len(others)
@@ -259,11 +260,6 @@ def still_of(parts_m: Sequence[F32 | F64], kinds: Sequence[int]) -> Still:
         return Still(points, first, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64))
     low, high = (f.reduceat(points, first[:-1]) for f in (np.minimum, np.maximum))
     return Still(points, first, low, high, np.array(kinds, np.int64))
-
-
-def _placed(model: ObjectModel, T: F64) -> list[F64]:
-    """The world corners of an object's parts, each (V, 3)."""
-    return [part.astype(np.float64) @ T[:3, :3].T + T[:3, 3] for part in model.convex_parts_m]
 
 
 def _static_around(scene: SettledScene, around_m: float) -> tuple[list[F32], list[bool]]:

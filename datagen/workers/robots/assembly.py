@@ -10,7 +10,7 @@ import numpy as np
 
 from datagen.schemas.identity import digest_of
 from datagen.schemas.safe_files import read_regular
-from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.mesh import F32, F64, transformed
 from datagen.workers.geometry.planar import prism_corners, unit_circle
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.kinematics.tree import KinematicTree
@@ -199,4 +199,4 @@ def _with_reach(source: RobotSource, found: Assembly) -> Assembly:
 def _tube(T_flange: F64, length_m: float, rule: ScaleKeys) -> F32:
     outer = rule.tube_radius_m / np.cos(np.pi / _TUBE_SIDES)  # the prism's sides touch the tube from outside
     points = prism_corners(outer * unit_circle(_TUBE_SIDES, 0.5), 0.0, length_m)
-    return (points @ T_flange[:3, :3].T + T_flange[:3, 3]).astype(np.float32)
+    return transformed(points, T_flange).astype(np.float32)

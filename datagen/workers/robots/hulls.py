@@ -22,7 +22,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.content_cache import CacheFolder, version_of
 from datagen.workers.extras import how_to_get
-from datagen.workers.geometry.mesh import F32, F64, I32
+from datagen.workers.geometry.mesh import F32, F64, I32, transformed
 from datagen.workers.geometry.planar import prism_corners, unit_circle
 from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.urdf import MOST, Shape
@@ -65,7 +65,7 @@ def shape_parts(shape: Shape, scale: float, cuts_m: tuple[float, ...] = ()) -> P
         cuts = tuple(sorted(height / float(shape.scale[2]) for height in cuts_m))
         hulls = tuple(hull * shape.scale for hull in mesh_hulls(shape.mesh, cuts))
     T = shape.T_link_shape
-    parts = tuple(((hull @ T[:3, :3].T + T[:3, 3]) * scale).astype(np.float32) for hull in hulls)
+    parts = tuple((transformed(hull, T) * scale).astype(np.float32) for hull in hulls)
     if any(map(_is_flat, parts)):
         fix = "Correct it, or leave its link out with arm.ignore"
         raise InputError(shape.path, shape.where, "has no volume", fix)

@@ -9,7 +9,7 @@ from hashlib import sha256
 import numpy as np
 
 from datagen.workers.content_cache import CacheFolder, version_of
-from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.mesh import F64, transformed
 from datagen.workers.kinematics.tree import KinematicTree, frame_poses
 
 _STARTS = 32
@@ -61,8 +61,8 @@ def _ascended_m(*parts: bytes) -> float:
         # The TCP in each joint's own frame, before that joint turns: (S, 3) for every joint.
         points = [np.broadcast_to(chain.tcp_m, (_STARTS, 3))]
         for k in range(count - 1, 0, -1):
-            T = chain.T_parent_joint[k]
-            points.append(_turned(points[-1], chain.axis[k], cross[k], q[:, k]) @ T[:3, :3].T + T[:3, 3])
+            turned = _turned(points[-1], chain.axis[k], cross[k], q[:, k])
+            points.append(transformed(turned, chain.T_parent_joint[k]))
         points.reverse()
         shoulder = np.zeros((_STARTS, 3))  # in the frame of joint k, after it has turned
         for k in range(1, count):

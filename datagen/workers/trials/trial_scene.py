@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from datagen.schemas.specification import TrialParams
-from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.mesh import F32, F64, transformed_parts
 from datagen.workers.geometry.planar import prism_corners, unit_circle
 from datagen.workers.geometry.transforms import translation
 from datagen.workers.objects.part_merging import merge_parts
@@ -106,8 +106,7 @@ def _body(
     parts: list[F32] = []
     mass, moment, about_origin = 0.0, np.zeros(3), np.zeros((3, 3))
     for link, T in rigid:
-        for part in link.parts_m:
-            parts.append((part @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
+        parts += transformed_parts(link.parts_m, T)
         if link.inertial is not None:
             centre = T[:3, :3] @ link.inertial.centre_m + T[:3, 3]
             mass += link.inertial.mass_kg
