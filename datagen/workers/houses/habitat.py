@@ -293,20 +293,16 @@ def _centre_m(files: AssetFiles, template: _Template) -> F64:
 
 def _pose(entry: JsonNode, *, is_stage: bool = False) -> F64:
     """`T_world_object` of an instance; a stage that states no translation is at the origin."""
-    at = entry.find("translation") if is_stage else entry.get("translation")
-    x, y, z = (0.0, 0.0, 0.0) if at is None else at.numbers(3, -EXTENT_M, EXTENT_M)
-    found = entry.find("rotation")
-    q = np.array([1.0, 0, 0, 0] if found is None else found.numbers(4, -2.0, 2.0))
+    at = entry.given("translation", [0, 0, 0]) if is_stage else entry.get("translation")
+    position_m = at.numbers(3, -EXTENT_M, EXTENT_M)
+    q = np.array(entry.given("rotation", [1, 0, 0, 0]).numbers(4, -2.0, 2.0))
     if not 0.5 < np.linalg.norm(q) < 2.0:
         raise entry.get("rotation").error("is not a unit quaternion")
-    scale = entry.find("uniform_scale")
-    stretched = entry.find("non_uniform_scale")
-    factors = np.full(3, 1.0 if scale is None else scale.number(1e-3, 1e3))
-    if stretched is not None:
-        factors = factors * stretched.numbers(3, 1e-3, 1e3)
+    scale = entry.given("uniform_scale", 1).number(1e-3, 1e3)
+    factors = scale * np.array(entry.given("non_uniform_scale", [1, 1, 1]).numbers(3, 1e-3, 1e3))
     T = np.eye(4)
     T[:3, :3] = rotation_of(q) * factors
-    T[:3, 3] = (x, y, z)
+    T[:3, 3] = position_m
     return _in_world(T)
 
 
