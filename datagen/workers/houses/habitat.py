@@ -13,9 +13,10 @@ Frame of the files: right-handed, y up; world (x, y, z) = (x, -z, y). Rotations 
 from __future__ import annotations
 
 import hashlib
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -118,7 +119,6 @@ class HabitatHouses:
     carrying: frozenset[str] = CARRYING_TYPES | {"Object"}  # types whose flat tops support objects
     statement: Mapping[str, str] = field(default_factory=dict)
     kind: str = "habitat"
-    _templates: OrderedDict[tuple[object, ...], _Template] = field(default_factory=OrderedDict)
 
     def house_ids(self) -> list[str]:
         """Ids, sorted: the scene's path below the root, or the folder of scenes, without its ending."""
@@ -134,7 +134,7 @@ class HabitatHouses:
         scene, text = self._scene(house_id)
         digest = hashlib.sha256(text)
         entry = scene.get("stage_instance")
-        stage = self._template(self._stage_files(entry), is_stage=True)
+        stage = self._template(self._stage_files(entry), True)
         digest.update(stage.digest)
         T_world = (
             _pose(entry, is_stage=True) if self.stage_turn is None else _in_world(self.stage_turn(house_id))
@@ -144,7 +144,7 @@ class HabitatHouses:
         placed: list[tuple[StaticBody, F64, F64, Mesh]] = []
         instances, findings = self._instances(scene)
         for number, name, files, entry, T_world in instances:
-            template = self._template(files)
+            template = self._template(files, False)
             digest.update(template.digest)
             if is_about_centre(entry, scene):
                 centre_m = _centre_m(files, template)
@@ -198,24 +198,9 @@ class HabitatHouses:
         refuse_upside_down(scene, [T for *_, T in found], findings)
         return found, findings
 
-    def _template(self, files: AssetFiles, *, is_stage: bool = False) -> _Template:
-        key = files.mesh, files.collision, files.scale, is_stage
-        if key in self._templates:
-            self._templates.move_to_end(key)
-            return self._templates[key]
-        S = np.diag([*files.scale, 1.0])
-        mesh, digest = read_glb(files.mesh).transformed(_Y_UP_TO_WORLD @ S), file_digest(files.mesh)
-        solid = mesh
-        if files.collision is not None:
-            solid = read_glb(files.collision).transformed(_Y_UP_TO_WORLD @ S)
-            digest = hashlib.sha256(digest + file_digest(files.collision)).digest()
-        if files.scale != (1.0, 1.0, 1.0):
-            digest = hashlib.sha256(digest + S.tobytes()).digest()
-        template = _Template(mesh, () if is_stage else convex_parts(solid), digest)
-        self._templates[key] = template
-        if len(self._templates) > _KEPT_MESHES:
-            self._templates.popitem(last=False)
-        return template
+    @cached_property
+    def _template(self) -> Callable[[AssetFiles, bool], _Template]:
+        return lru_cache(_KEPT_MESHES)(_read_template)
 
     def _placed(
         self, number: int, name: str, files: AssetFiles, template: _Template, T: F64
@@ -279,6 +264,18 @@ def open_habitat(place: str) -> HabitatHouses:
 
     scenes = dict(sorted(scenes.items()))
     return HabitatHouses(root, digest, scenes, types, find, statement=read_statement(root))
+
+
+def _read_template(files: AssetFiles, is_stage: bool) -> _Template:
+    S = np.diag([*files.scale, 1.0])
+    mesh, digest = read_glb(files.mesh).transformed(_Y_UP_TO_WORLD @ S), file_digest(files.mesh)
+    solid = mesh
+    if files.collision is not None:
+        solid = read_glb(files.collision).transformed(_Y_UP_TO_WORLD @ S)
+        digest = hashlib.sha256(digest + file_digest(files.collision)).digest()
+    if files.scale != (1.0, 1.0, 1.0):
+        digest = hashlib.sha256(digest + S.tobytes()).digest()
+    return _Template(mesh, () if is_stage else convex_parts(solid), digest)
 
 
 def _centre_m(files: AssetFiles, template: _Template) -> F64:

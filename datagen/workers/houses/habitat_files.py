@@ -21,7 +21,7 @@ _MAX_FILES = 200_000  # files of one kind
 _MAX_CLASSES = 10_000
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class AssetFiles:
     """The files of a stage or an object; `scale` (3,) is along the mesh's axes."""
 
