@@ -307,12 +307,8 @@ def _upright(tree: KinematicTree) -> tuple[int, F64]:
 
     Joints below it may slide up and down; -1 where there is none.
     """
-    way, j = list[int](), int(tree.frame_joint[-1])
-    while j >= 0:
-        way.append(j)
-        j = int(tree.parent[j])
     T = np.eye(4)
-    for j in reversed(way):
+    for j in reversed(tree.hand_joints()):
         T = T @ tree.T_parent_joint[j]
         axis = T[:3, :3] @ tree.axis[j]
         if np.abs(axis[:2]).max() > 1e-6:
