@@ -16,7 +16,7 @@ from scipy.ndimage import binary_erosion
 from datagen.display.styles import PHASE_COLOURS, TARGET
 from datagen.drawing.floor_plan import height_m
 from datagen.drawing.posed_robot import RobotBodies
-from datagen.workers.geometry.mesh import F64, Mesh, concatenate, transformed
+from datagen.workers.geometry.mesh import BOX_BITS, F64, Mesh, concatenate, transformed
 from datagen.workers.geometry.transforms import inverse, look_at
 from datagen.workers.houses.house import House, StaticBody
 from datagen.workers.rendering import Camera, Pixels, pixel_directions
@@ -312,8 +312,7 @@ def _around(stage: RayScene, camera: Camera) -> npt.NDArray[np.int64]:
 
 def _cubes(centres_m: F64, half_m: float) -> F64:
     """The corners (8 N, 3) of cubes around points (N, 3)."""
-    corners = ((np.arange(8)[:, None] >> np.arange(3)) & 1) * 2.0 - 1.0
-    return (centres_m[:, None, :] + half_m * corners).reshape(-1, 3)
+    return (centres_m[:, None, :] + half_m * (BOX_BITS * 2.0 - 1.0)).reshape(-1, 3)
 
 
 def _rays_without(house: House, left_out: Sequence[StaticBody]) -> RayMesh:

@@ -14,6 +14,7 @@ F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 I32 = npt.NDArray[np.int32]
 U8 = npt.NDArray[np.uint8]
+BOX_BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1  # (8, 3), 1 where a box's corner is at the high end
 
 
 @dataclass(frozen=True, eq=False)

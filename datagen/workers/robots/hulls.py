@@ -22,7 +22,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.content_cache import CacheFolder, version_of
 from datagen.workers.extras import how_to_get
-from datagen.workers.geometry.mesh import F32, F64, I32, transformed
+from datagen.workers.geometry.mesh import BOX_BITS, F32, F64, I32, transformed
 from datagen.workers.geometry.planar import prism_corners, unit_circle
 from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.urdf import MOST, Shape
@@ -37,7 +37,6 @@ _FIX = "Correct the file, or install its package again"
 _MISSING = "Correct the URDF; package://NAME is a folder NAME above it, or an installed package NAME"
 _FORMATS = (".obj", ".stl", ".dae", ".glb")
 _UNIT = re.compile(rb"""<unit\s[^>]*?\bmeter\s*=\s*["']\s*([0-9.eE+-]+)""")
-_BOX_BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
 _TAKEN_AT_ONCE = 4
 _PUSHES = 50
 _TOUCHING_M = 1e-6
@@ -91,7 +90,7 @@ def _is_flat(part: F32) -> bool:
 def _solid(size_m: F64) -> F64:
     """Corners (V, 3) of a box, or of prisms around a cylinder (radius, length) or a sphere (radius)."""
     if len(size_m) == 3:
-        return (_BOX_BITS - 0.5) * size_m
+        return (BOX_BITS - 0.5) * size_m
     if len(size_m) == 1:
         return _BALL * size_m[0]
     ring = _RING * (size_m[0] / np.cos(np.pi / len(_RING)))
