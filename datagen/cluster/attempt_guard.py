@@ -63,7 +63,9 @@ class Meter:
     def __init__(self) -> None:
         self.watch: Watch | None = None  # reports the attempt's progress to the driver's display
         self._wall, self._cpu = time.perf_counter(), time.process_time()
-        _reset_peak_memory()
+        # Linux: resets VmHWM to the current memory, so that the peak is the attempt's.
+        with suppress(OSError):  # otherwise the peak is that of the whole process
+            Path("/proc/self/clear_refs").write_text("5")
 
     def cost(self, clock: StageClock | None = None, written_bytes: int = 0) -> Cost:
         """The cost so far. Time outside the stages of `clock` has no stage."""
@@ -176,14 +178,6 @@ def this_host() -> Host:
     )
 
 
-def _reset_peak_memory() -> None:
-    # Linux: resets VmHWM to the current memory, so that the peak is the attempt's.
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return  # otherwise the peak is that of the whole process
-
-
 def _peak_memory_bytes() -> int:
     status = Path("/proc/self/status")
     if status.is_file():
@@ -240,12 +234,9 @@ def collect_post_mortem(notes: str, attempt: str) -> Note:
     if not notes:
         return Note()
     note, path = read_note(notes, attempt) or Note(), stack_path(notes, attempt)
-    try:
-        with path.open("rb") as file:
-            file.seek(max(0, path.stat().st_size - STACK_LIMIT))
-            note = replace(note, stack=file.read(STACK_LIMIT).decode(errors="replace"))
-    except FileNotFoundError:
-        pass
+    with suppress(FileNotFoundError), path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - STACK_LIMIT))
+        note = replace(note, stack=file.read(STACK_LIMIT).decode(errors="replace"))
     for file in (path, note_path(notes, attempt), beat_path(notes, attempt)):
         file.unlink(missing_ok=True)
     return note

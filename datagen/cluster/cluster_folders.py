@@ -9,7 +9,7 @@ import os
 import shutil
 import signal
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import psutil
@@ -47,10 +47,8 @@ def end_processes(processes: list[psutil.Process]) -> None:
     """Send SIGTERM and, some seconds later, SIGKILL to the remaining processes; wait until all have ended."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         for process in processes:
-            try:
+            with suppress(psutil.Error):
                 process.send_signal(number)
-            except psutil.Error:
-                continue
         _, processes = psutil.wait_procs(processes, timeout=_STOP_WITHIN_S)
     psutil.wait_procs([process for process in processes if is_alive(process)], timeout=_KILL_WITHIN_S)
 

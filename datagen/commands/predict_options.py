@@ -28,7 +28,7 @@ else:
     # Types that the command line resolves without importing torch.
     Frames, Maps, Checkpoint, Outline = Sequence[Path], Sequence[Path], str | Path, str
 
-_UNSET = Parameter(show_default=False)  # an empty list says nothing
+UNSET = Parameter(show_default=False)  # an empty list says nothing
 _LARGEST_M = 10.0
 
 
@@ -99,8 +99,8 @@ class PredictOptions:
     export: File | None = None
     frame: Frames | None = None
     bag: File | None = None
-    at: Annotated[Sequence[float], _UNSET] = ()
-    topic: Annotated[Sequence[str], _UNSET] = ()
+    at: Annotated[Sequence[float], UNSET] = ()
+    topic: Annotated[Sequence[str], UNSET] = ()
     click: Annotated[tuple[int, int] | None, _CLICK] = None
     box: Annotated[tuple[int, int, int, int] | None, _BOX] = None
     camera_height: float | None = None
@@ -114,8 +114,8 @@ class PredictOptions:
     ] = None
     depth_scale: float | None = None
     allow_unseen: bool = False
-    map: Annotated[Maps, _UNSET] = ()
-    keep_out: Annotated[Maps, _UNSET] = ()
+    map: Annotated[Maps, UNSET] = ()
+    keep_out: Annotated[Maps, UNSET] = ()
     arrival: str | None = None
     out: File | None = None
     html: File | None = None

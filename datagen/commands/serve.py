@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from datagen.commands.predict import predict, refuse_robot
-from datagen.commands.predict_options import PredictOptions
+from datagen.commands.predict_options import UNSET, PredictOptions
 from datagen.console.command_lines import options_of
 from datagen.console.options import File
 from datagen.display.progress import Progress
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from datagen.train.prediction import Prediction
     from datagen.train.prediction.frames import SensorFrame
-
-_UNSET = Parameter(show_default=False)
 
 
 @dataclass(frozen=True)
@@ -55,8 +53,8 @@ class ServeOptions:
     base_height: float | None = None
     reach: float | None = None
     footprint: str | None = None
-    map: Annotated[Sequence[Path], _UNSET] = ()
-    keep_out: Annotated[Sequence[Path], _UNSET] = ()
+    map: Annotated[Sequence[Path], UNSET] = ()
+    keep_out: Annotated[Sequence[Path], UNSET] = ()
     host: str = "127.0.0.1"
     port: int = 8765
     token: File | None = None

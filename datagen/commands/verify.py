@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from datagen.console.command_lines import command_line
-from datagen.console.options import AsJson, AssetSources, RunPath, Sources, Whole
+from datagen.console.options import AS_FOUND, AsJson, AssetSources, RunPath, Sources, Whole
 from datagen.console.printing import counted, listed, print_json, print_lines, print_rows, seconds, size
 from datagen.display.progress import counting
 from datagen.exports.export_record import EXPORT, ExportRecord, check_export, read_export
@@ -20,7 +20,6 @@ from datagen.schemas.storage import Storage, open_storage
 
 _KEPT = 10_000  # findings that are listed; all are counted
 _SHOWN = 50  # findings on a terminal
-_AS_FOUND = AssetSources()
 
 
 def verify(
@@ -30,7 +29,7 @@ def verify(
     repair: bool = False,
     replay: Whole = 0,
     clean: bool = False,
-    given: AssetSources = _AS_FOUND,
+    given: AssetSources = AS_FOUND,
     json: AsJson = False,
 ) -> int:
     """Check a run: every record and its copy, every file and its rows, the ledger, the sealed store.

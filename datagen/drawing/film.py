@@ -16,7 +16,7 @@ from scipy.ndimage import binary_erosion
 from datagen.display.styles import PHASE_COLOURS, TARGET
 from datagen.drawing.floor_plan import height_m
 from datagen.drawing.posed_robot import RobotBodies
-from datagen.workers.geometry.mesh import F64, Mesh, concatenate
+from datagen.workers.geometry.mesh import BOX_BITS, F64, Mesh, concatenate, transformed
 from datagen.workers.geometry.transforms import inverse, look_at
 from datagen.workers.houses.house import House, StaticBody
 from datagen.workers.rendering import Camera, Pixels, pixel_directions
@@ -301,7 +301,7 @@ def _around(stage: RayScene, camera: Camera) -> npt.NDArray[np.int64]:
     """Pixels of the rectangles around the bodies' images; all where one is beside or behind the camera."""
     shown = np.zeros((camera.height_px, camera.width_px), np.bool_)
     for rays, T in zip(stage.objects, inverse(camera.T_world_camera) @ stage.T_world_object, strict=True):
-        corners_m = rays.around_m @ T[:3, :3].T + T[:3, 3]
+        corners_m = transformed(rays.around_m, T)
         if corners_m[:, 2].min() < 1e-3:
             return np.arange(shown.size)
         at_px = camera.fx_px * corners_m[:, :2] / corners_m[:, 2:] + (camera.cx_px, camera.cy_px)
@@ -312,8 +312,7 @@ def _around(stage: RayScene, camera: Camera) -> npt.NDArray[np.int64]:
 
 def _cubes(centres_m: F64, half_m: float) -> F64:
     """The corners (8 N, 3) of cubes around points (N, 3)."""
-    corners = ((np.arange(8)[:, None] >> np.arange(3)) & 1) * 2.0 - 1.0
-    return (centres_m[:, None, :] + half_m * corners).reshape(-1, 3)
+    return (centres_m[:, None, :] + half_m * (BOX_BITS * 2.0 - 1.0)).reshape(-1, 3)
 
 
 def _rays_without(house: House, left_out: Sequence[StaticBody]) -> RayMesh:

@@ -25,7 +25,7 @@ from datagen.display.styles import (
     Style,
 )
 from datagen.schemas.fields import OUTCOMES
-from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.mesh import F64, transformed
 from datagen.workers.geometry.planar import convex_hull, polygons_at
 from datagen.workers.houses.house import StaticBody
 from datagen.workers.scenes.reconstruct import ReconstructedScene
@@ -62,8 +62,8 @@ def draw_plan(axes: Axes, recalled: ReconstructedScene, base_xy_m: F64) -> list[
     pale: dict[str, Any] = {"transform": axes.transAxes, "color": "white", "alpha": 0.5, "lw": 0, "zorder": 4}
     axes.add_patch(Rectangle((0, 0), 1, 1, **pale))
     for k, (model, T) in enumerate(zip(recalled.models, recalled.T_world_object, strict=True)):
-        points = np.concatenate(model.convex_parts_m).astype(np.float64)
-        outline, style = convex_hull((points @ T[:3, :3].T + T[:3, 3])[:, :2]), CLUTTER if k else TARGET
+        points = transformed(np.concatenate(model.convex_parts_m), T)
+        outline, style = convex_hull(points[:, :2]), CLUTTER if k else TARGET
         axes.add_patch(Polygon(outline, fc=style.colour, ec=style.edge, lw=0.5, zorder=5))
     _draw_camera(axes, recalled)
     axes.set(xlim=(x - half_m, x + half_m), ylim=(y - half_m, y + half_m), xlabel="x [m]", ylabel="y [m]")

@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw
 
 from datagen.drawing.film import View, font_of, no_house
 from datagen.drawing.posed_robot import RobotBodies, robot_bodies
-from datagen.workers.geometry.mesh import F64, Mesh
+from datagen.workers.geometry.mesh import BOX_BITS, F64, Mesh, transformed
 from datagen.workers.geometry.transforms import inverse, translation
 from datagen.workers.rendering.embree import RayMesh, RayScene, ray_mesh
 from datagen.workers.robots.hulls import hull_faces
@@ -55,7 +55,7 @@ def _hand(robot: Robot, bodies: RobotBodies) -> Image.Image:
     rows = [k for k, link in enumerate(bodies.link) if link >= robot.first_hand_link]
     depth_m = float(gripper.pad_depth_m(np.array([width_m]))[0])
     half_m = np.array([gripper.pad_size_m[0], width_m, gripper.pad_size_m[1]]) / 2
-    corners_m = (((np.arange(8)[:, None] >> np.arange(3)) & 1) * 2.0 - 1) * half_m + (0.0, 0.0, depth_m)
+    corners_m = (BOX_BITS * 2.0 - 1) * half_m + (0.0, 0.0, depth_m)
     faces, _ = hull_faces(corners_m.astype(np.float32))
     box = Mesh(corners_m.astype(np.float32), faces, np.tile(np.array(_BOX, np.uint8), (len(faces), 1)))
     points = _points(bodies, T, rows)
@@ -71,7 +71,7 @@ def _picture(eye_m: F64, points_m: F64, rays: list[RayMesh], T: list[F64]) -> Im
 
 def _points(bodies: RobotBodies, T: F64, rows: list[int] | None = None) -> F64:
     chosen = range(len(bodies.rays)) if rows is None else rows
-    return np.concatenate([bodies.rays[k].mesh.vertices_m @ T[k, :3, :3].T + T[k, :3, 3] for k in chosen])
+    return np.concatenate([transformed(bodies.rays[k].mesh.vertices_m, T[k]) for k in chosen])
 
 
 def _floor(robot: Robot) -> list[Mesh]:

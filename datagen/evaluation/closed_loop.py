@@ -13,7 +13,7 @@ import numpy.typing as npt
 from datagen.console.options import AssetSources
 from datagen.evaluation.arrival_outcomes import Arrived, SceneTask, read_outcomes, scene_generator
 from datagen.evaluation.columns import Columns
-from datagen.evaluation.comparisons import Method, comparisons
+from datagen.evaluation.comparisons import SEED, Method, comparisons
 from datagen.evaluation.grids import (
     AT_RANDOM,
     BY_LABELS,
@@ -26,7 +26,6 @@ from datagen.evaluation.grids import (
     method_values,
     smoothed,
 )
-from datagen.evaluation.methods import SEED
 from datagen.evaluation.report import RESAMPLES
 from datagen.evaluation.runs import EvaluatedRun
 from datagen.evaluation.scores import weights_for

@@ -17,6 +17,7 @@ from datagen.train.inputs import F64, I64
 
 # In order of training: the paper compares each with the one before it.
 REGIMES = ("stage1", "sim-only", "two-stage")
+SEED = 0  # of resamples and arrivals
 # By method and metric.
 Estimates = Mapping[str, Mapping[str, Estimate]]
 

@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from datagen.train.training.checkpoints import CheckpointHead
 
 NONE = "none"
-# Seed of resamples, arrivals and fitted baselines.
-SEED = 0
 # Training regime of a checkpoint's stage: stage 2 is the second of two stages.
 REGIMES = {"stage1": "stage1", "sim-only": "sim-only", "stage2": "two-stage"}
 
@@ -187,7 +185,7 @@ def baseline_methods(
     specs += [spec for path in fit for spec in specs_of(path)]
     arms = [spec.arm for spec in specs if spec.arm is not None]
     robots = tuple(dict.fromkeys(arm.robot_key for arm in arms if arm.robot in ROBOTS))
-    made = make_baselines(names, heuristic, SEED, robots)
+    made = make_baselines(names, heuristic, robots)
     calibrations: dict[str, Calibration] = {}
     houses: frozenset[str] = frozenset()
     if fit:

@@ -10,9 +10,9 @@ import numpy as np
 
 from datagen import __version__
 from datagen.evaluation.columns import Columns
-from datagen.evaluation.comparisons import Method
+from datagen.evaluation.comparisons import SEED, Method
 from datagen.evaluation.grids import arrival_table, decisive_grids
-from datagen.evaluation.methods import SEED, EvaluatedMethod
+from datagen.evaluation.methods import EvaluatedMethod
 from datagen.evaluation.runs import EvaluatedRun
 from datagen.evaluation.score_files import ScoreFile
 from datagen.evaluation.scores import evaluate_grids, evaluate_set, weights_for
@@ -116,14 +116,14 @@ def _part(part: Part, methods: Sequence[Method], arrivals: Sequence[Arrival]) ->
         covered = columns.of_scenes(np.isin(columns.run, runs))
         weights = weights_for(covered, RESAMPLES, SEED)
         try:
-            scored[name] = evaluate_set(covered, methods, name, weights, SEED) | {"runs": list(runs)}
+            scored[name] = evaluate_set(covered, methods, name, weights) | {"runs": list(runs)}
         except InputError as error:
             left_out[name] = error.problem
     grids = None
     if columns.is_grid.any():
         whole = columns.of_scenes(columns.is_grid)
         weights = weights_for(whole, RESAMPLES, SEED)
-        grids = evaluate_grids(whole, methods, weights, SEED)
+        grids = evaluate_grids(whole, methods, weights)
         if grids["scenes"] == grids["scenes_without_positive"]:
             left_out["whole grids"] = f"none of {grids['scenes']} has a positive candidate"
             grids = None

@@ -12,6 +12,7 @@ import numpy as np
 
 from datagen.evaluation.columns import Columns
 from datagen.evaluation.comparisons import (
+    SEED,
     Estimates,
     Method,
     by_recipe,
@@ -41,12 +42,8 @@ def evaluate_set(
     methods: Sequence[Method],
     candidates: str,
     weights: Weights,
-    seed: int = 0,
 ) -> dict[str, Any]:
-    """Return the report of one candidate set; `weights` (B, S) resample the scenes of `columns`.
-
-    `seed` draws the trainings of each resample where some differ by their seed alone.
-    """
+    """Return the report of one candidate set; `weights` (B, S) resample the scenes of `columns`."""
     columns = columns.at(columns.is_in(candidates))
     n, positives = len(columns), int(columns.label.sum())
     if not n:
@@ -71,7 +68,7 @@ def evaluate_set(
             }
             for m in methods
         },
-        **_over_seeds(estimates, methods, METRICS, seed),
+        **_over_seeds(estimates, methods, METRICS),
     }
 
 
@@ -103,12 +100,10 @@ def _estimates(columns: Columns, method: Method, decisions: F64, weights: Weight
     }
 
 
-def _over_seeds(
-    estimates: Estimates, methods: Sequence[Method], names: Sequence[str], seed: int
-) -> dict[str, Any]:
+def _over_seeds(estimates: Estimates, methods: Sequence[Method], names: Sequence[str]) -> dict[str, Any]:
     """Means over trainings that differ by their seed alone, which stand for them in comparisons."""
     alike = by_recipe({m.name: m.recipe for m in methods})
-    means = means_of(estimates, alike, np.random.default_rng([seed, len(methods)]))
+    means = means_of(estimates, alike, np.random.default_rng([SEED, len(methods)]))
     origins = {m.name: m.origin for m in methods}
     origins |= {name: origins[members[0]] for name, members in alike.items()}
     averaged = {member for members in alike.values() for member in members}
@@ -122,9 +117,7 @@ def _over_seeds(
     }
 
 
-def evaluate_grids(
-    columns: Columns, methods: Sequence[Method], weights: Weights, seed: int = 0
-) -> dict[str, Any]:
+def evaluate_grids(columns: Columns, methods: Sequence[Method], weights: Weights) -> dict[str, Any]:
     """Grid selection: the best clear candidate of each scene; all scenes of `columns` are whole grids."""
     clear = columns.is_clear
     positives = np.bincount(columns.scene, columns.label & clear, columns.n_scenes)
@@ -138,7 +131,7 @@ def evaluate_grids(
         "positives_per_scene": float(positives[some].mean()) if some.any() else None,
         "any_clear": float((positives[some] / offered[some]).mean()) if some.any() else None,
         "methods": {name: {k: e.values() for k, e in found.items()} for name, found in estimates.items()},
-        **_over_seeds(estimates, methods, GRID_METRICS, seed),
+        **_over_seeds(estimates, methods, GRID_METRICS),
     }
 
 

@@ -162,7 +162,7 @@ def refuse_other(place: str, stored: Manifest, given: Manifest) -> None:
 
 
 MAX_STACK_CHARS = 20_000
-LOST_CAUSE = "it left no record, and its shard was decided without it"
+_LOST_CAUSE = "it left no record, and its shard was decided without it"
 
 
 class Ledger:
@@ -238,13 +238,13 @@ def is_guess(end: LedgerEntry) -> bool:
     return end.outcome == "lost" and end.cost is None
 
 
-def lost_end(start: AttemptStart, ended: str = "", cause: str = LOST_CAUSE) -> LedgerEntry:
+def lost_end(start: AttemptStart, ended: str) -> LedgerEntry:
     """The end record of an attempt that left none, with unknown cost.
 
     It is a guess, made once the shard is decided: the attempt, if still running, may replace it.
     """
     named = {name: getattr(start, name) for name in ("attempt", "shard", "started")}
-    return LedgerEntry(outcome="lost", cause=cause, ended=ended, **named)
+    return LedgerEntry(outcome="lost", cause=_LOST_CAUSE, ended=ended, **named)
 
 
 def superseded_end(commit: Commit, cause: str, started: str = "") -> LedgerEntry:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import shutil
 import stat
 import tempfile
 import tokenize
@@ -15,7 +14,6 @@ import zipfile
 import zlib
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
-from functools import partial
 from io import BufferedReader
 from pathlib import Path
 from typing import IO
@@ -105,13 +103,8 @@ def read_regular(path: Path, most_bytes: int, fix: str) -> bytes:
     return data
 
 
-_remove_tree = partial(shutil.rmtree, ignore_errors=True)
-
-
 @contextmanager
-def locked_folder(
-    kind: str, parent: Path, remove: Callable[[Path], object] = _remove_tree
-) -> Generator[Path]:
+def locked_folder(kind: str, parent: Path, remove: Callable[[Path], object]) -> Generator[Path]:
     """Give a new folder of mode 0700, whose name begins with `kind`; `remove` removes it after the block.
 
     First removes folders of killed processes of this user, whose locks the kernel has released.

@@ -9,7 +9,7 @@ import contextlib
 import os
 import stat
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -68,6 +68,12 @@ class CacheFolder:
             with whole_file(path) as file:
                 np.savez(file, **contents)
             drop_unused(path.parent, self.most_files)
+
+    def computed(self, key: str, compute: Callable[[], Arrays]) -> Arrays:
+        """The arrays stored under a key, or else those that `compute` returns, which are then stored."""
+        if (stored := self.load(key)) is None:
+            self.store(key, stored := compute())
+        return stored
 
     def _path(self, key: str) -> Path:
         return cache_folder() / self.folder / f"{key}.npz"

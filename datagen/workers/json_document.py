@@ -40,6 +40,10 @@ class JsonNode(NamedTuple):
         value = self._members().get(key)
         return None if value is None else JsonNode(self.place, f"{self.path}.{key}", value)
 
+    def given(self, key: str, default: Any) -> JsonNode:
+        """The member of an object, or `default` where it is absent or null."""
+        return self.find(key) or JsonNode(self.place, f"{self.path}.{key}", default)
+
     def items(self, limit: int) -> Iterator[JsonNode]:
         """The elements of a list of at most `limit`."""
         if not isinstance(self.value, list):

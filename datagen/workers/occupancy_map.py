@@ -68,7 +68,7 @@ def read_map(path: Path) -> OccupancyMap:
     if not isinstance(document, dict) or "image" not in document:
         raise InputError(path, "image", "is missing", _FIX)
     name = node.get("image").text()
-    mode = "trinary" if (given := node.find("mode")) is None else given.text()
+    mode = node.given("mode", "trinary").text()
     if mode not in ("trinary", "scale"):
         raise InputError(path, "mode", f"is {mode}", "Save the map as trinary or scale")
     resolution_m = node.get("resolution").number(0.001, 1.0)
@@ -78,10 +78,10 @@ def read_map(path: Path) -> OccupancyMap:
             path, "origin", f"has {len(origin)} numbers", "Give x, y and yaw of the lower left corner"
         )
     occupied, free = (
-        default if (given := node.find(key)) is None else given.number(0.0, 1.0)
+        node.given(key, default).number(0.0, 1.0)
         for key, default in (("occupied_thresh", 0.65), ("free_thresh", 0.25))
     )
-    negated = (flag := node.find("negate")) is not None and flag.value
+    negated = node.given("negate", 0).value
     if negated not in (0, 1):
         raise InputError(path, "negate", f"is {negated!r:.80}", "Write 0 or 1")
     grey, alpha = read_grey(picture := path.parent / name)

@@ -114,11 +114,10 @@ class World:
 def _target_names(objects: ObjectSource) -> list[str]:
     """Names of the objects that fit a gripper, cached by the source's content: a check loads them all."""
     key = f"{objects.kind}-{objects.digest}-{GRIPPER_VERSION}"
-    stored = _TARGETS.load(key)
-    if stored is None:
-        names = [name for name in objects.names() if objects.load(name).can_be_target]
-        stored = {"names": np.array(names, np.str_)}
-        _TARGETS.store(key, stored)
+    stored = _TARGETS.computed(
+        key,
+        lambda: {"names": np.array([n for n in objects.names() if objects.load(n).can_be_target], np.str_)},
+    )
     return stored["names"].tolist()
 
 

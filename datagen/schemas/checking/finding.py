@@ -118,9 +118,7 @@ def _filled(value: Any) -> Any:
     return [_filled(each) for each in value] if isinstance(value, list) else value
 
 
-def compare(
-    ours: Read[Record], copy: Read[Record], shard: int | None = None, fix: str = BACKUP
-) -> list[Finding]:
+def compare(ours: Read[Record], copy: Read[Record], fix: str = BACKUP) -> list[Finding]:
     """Check a record and its second copy; each restores the other.
 
     `fix` is the fix where both are valid but differ.
@@ -128,12 +126,12 @@ def compare(
     if ours.record is not None and copy.record is not None:
         if ours.data == copy.data:
             return []
-        return [Finding(ours.key, "record", f"differs from its copy {copy.key}", fix, shard)]
+        return [Finding(ours.key, "record", f"differs from its copy {copy.key}", fix)]
     for bad, good in ((copy, ours), (ours, copy)):
         if good.record is not None and good.data is not None:
-            return [curable(bad.key, "record", bad.problem, good.data, shard)]
+            return [curable(bad.key, "record", bad.problem, good.data)]
     damaged = [one for one in (ours, copy) if one.problem != "missing"]
-    return [Finding(one.key, "record", f"{one.problem}, as is its copy", BACKUP, shard) for one in damaged]
+    return [Finding(one.key, "record", f"{one.problem}, as is its copy", BACKUP) for one in damaged]
 
 
 def sound(ours: Read[Record], copy: Read[Record]) -> Record | None:

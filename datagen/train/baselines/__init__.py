@@ -36,13 +36,9 @@ BASELINES: dict[str, Callable[[], Baseline]] = {
 def make_baselines(
     names: Sequence[str],
     heuristic: HeuristicParams | None = None,
-    seed: int = 0,
     robots: Sequence[str] = tuple(ROBOTS),
 ) -> list[Baseline]:
-    """Return unfitted baselines. InputError for other names.
-
-    `seed` is for `scalars`, and `robots` names those that `reachability` supports.
-    """
+    """Return unfitted baselines, `reachability` for these robots. InputError for other names."""
     for name in names:
         if name not in BASELINES:
             raise InputError("--baselines", name, "is not a baseline", choices(BASELINES, name))
@@ -50,8 +46,6 @@ def make_baselines(
     for name in names:
         if name == "analytic" and heuristic is not None:
             made.append(Analytic(heuristic))
-        elif name == "scalars":
-            made.append(Scalars(seed))
         elif name == "reachability":
             made.append(Reachability(tuple(robots)))
         else:

@@ -14,6 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from datagen.train.inputs import F32, F64, Bools
+from datagen.workers.grasps.contacts import perpendicular
 from datagen.workers.kinematics.tree import frame_poses
 from datagen.workers.motion.reachable_set import AZIMUTHS, LEVELS, direction_parts, part_directions
 from datagen.workers.robots import gripper_of, open_robot, robot_limits
@@ -163,9 +164,7 @@ def _boxes(gripper: Gripper) -> F64:
 
 def _rolled(z: F64) -> F64:
     """Axes (A, _ROLLS, 3, 3), as columns, of hands that approach along unit vectors (A, 3)."""
-    aside: F64 = np.cross(z, np.eye(3)[np.abs(z).argmin(1)])
-    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
-    up: F64 = np.cross(z, aside)
+    aside, up = perpendicular(z)
     angle = (np.pi * np.arange(_ROLLS) / _ROLLS)[:, None]
     x: F64 = np.cos(angle) * aside[:, None] + np.sin(angle) * up[:, None]
     along = np.broadcast_to(z[:, None], x.shape)

@@ -172,7 +172,7 @@ def _camera(node: JsonNode) -> Intrinsics:
     size = [int(side.number(2, MAX_SIDE_PX)) for side in given if side is not None]
     lens = _numbers(node, _LENS, 14)
     if lens is None:
-        lens = [0.0 if (n := node.find(term)) is None else n.number(*_NUMBER) for term in _TERMS]
+        lens = [node.given(term, 0).number(*_NUMBER) for term in _TERMS]
     model = _first(node, "distortion_model", "model")
     name = "" if model is None else model.text()
     return Intrinsics(

@@ -100,13 +100,11 @@ def _own_entry(key: str, entry: JsonNode) -> Asset:
     asset_id = JsonNode(entry.place, entry.path, key).text()
     width, height, depth = (max(side, _THINNEST_M) for side in entry.get("size").numbers(3, 0.0, _MAX_SIZE_M))
     rest = entry.find("surface_height_m")
-    basis = entry.find("surface_basis")
     rest_height_m = None if rest is None else rest.number(0.0, 2 * _MAX_SIZE_M)
-    if basis is not None and basis.text() == "observed_lifted_5cm_over_bbox_top":
+    if entry.given("surface_basis", "").text() == "observed_lifted_5cm_over_bbox_top":
         rest_height_m = height  # all objects observed on it floated
-    found = entry.find("observed_support_levels")
-    nodes = [] if found is None else list(found.items(100))
-    levels = sorted(n.get("height_m").number(0.0, 2 * _MAX_SIZE_M) for n in nodes)
+    found = list(entry.given("observed_support_levels", []).items(100))
+    levels = sorted(n.get("height_m").number(0.0, 2 * _MAX_SIZE_M) for n in found)
     size_m = (width, depth, height)
     return Asset(asset_id, entry.get("objectType").text(), size_m, rest_height_m, tuple(levels))
 

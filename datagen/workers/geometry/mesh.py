@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 I32 = npt.NDArray[np.int32]
 U8 = npt.NDArray[np.uint8]
+BOX_BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1  # (8, 3), 1 where a box's corner is at the high end
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +44,17 @@ class Mesh:
     file: MeshFile | None = None
 
     def transformed(self, T_parent_mesh: F64) -> Mesh:
-        vertices_m = self.vertices_m @ T_parent_mesh[:3, :3].T + T_parent_mesh[:3, 3]
-        return Mesh(vertices_m.astype(np.float32), self.faces, self.face_rgb, self.texture, self.file)
+        return replace(self, vertices_m=transformed(self.vertices_m, T_parent_mesh).astype(np.float32))
+
+
+def transformed(points_m: F32 | F64, T: F64) -> F64:
+    """Points (..., 3) moved by a transform (4, 4)."""
+    return points_m @ T[:3, :3].T + T[:3, 3]
+
+
+def transformed_parts(parts_m: Iterable[F32 | F64], T: F64) -> tuple[F32, ...]:
+    """The corners (V, 3) of each part moved by a transform (4, 4)."""
+    return tuple(transformed(part, T).astype(np.float32) for part in parts_m)
 
 
 def face_normals(corners_m: F32) -> F32:

@@ -37,6 +37,22 @@ def _right_turns_cut(points: list[tuple[float, float]]) -> list[tuple[float, flo
     return chain[:-1]
 
 
+def cross(a: F64, b: F64) -> F64:
+    """The cross products (...) of vectors (..., 2)."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def unit_circle(corners: int, first: float = 0.0) -> F64:
+    """Corners (K, 2) of a regular polygon in the unit circle, counter-clockwise from `first` steps off x."""
+    angle = 2 * np.pi * (np.arange(corners) + first) / corners
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def prism_corners(outline_m: F64, low_m: float, high_m: float) -> F64:
+    """Corners (2 K, 3) of an upright prism over an outline (K, 2), the lower ones first."""
+    return np.concatenate([np.column_stack([outline_m, np.full(len(outline_m), z)]) for z in (low_m, high_m)])
+
+
 def stack_polygons(polygons_m: Sequence[F64]) -> F64:
     """Polygons of different length as one array (P, K, 2), padded by repeating the last corner."""
     longest = max((len(p) for p in polygons_m), default=1)
@@ -68,7 +84,7 @@ def signed_distances_to_convex(points_m: F64, polygons_m: F64) -> F64:
 def _signed_distances(points_m: F64, polygons_m: F64) -> F64:
     # Sides come first, and arrays are reused: reductions over a short last axis and new memory are slow.
     first, second = polygons_m, following(polygons_m)
-    area = (first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]).sum(1)
+    area = cross(first, second).sum(1)
     along_x, along_y = np.ascontiguousarray((second - first).T)[:, :, None]  # (K, 1, P)
     x, y = points_m.T[:, None, :, None] - np.ascontiguousarray(first.T)[:, :, None]  # (K, N, P)
     t, other = x * along_x, y * along_y
@@ -168,8 +184,7 @@ def crosses_itself(corners: F64) -> bool:
 
     def side(points: F64) -> F64:
         """Side (K, K) of each edge's line on which points (K, 2) are: 1 left, -1 right, 0 on it."""
-        rel = points[None] - corners[:, None]
-        return np.sign(along[..., 0] * rel[..., 1] - along[..., 1] * rel[..., 0])
+        return np.sign(cross(along, points[None] - corners[:, None]))
 
     parts = side(corners) * side(ends) < 0
     return bool((parts & parts.T).any())

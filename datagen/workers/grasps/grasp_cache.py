@@ -109,12 +109,8 @@ class _Known:
 
     def score(self, search: int, block: int) -> F32:
         if (search, block) not in self.scores:
-            key = file_digest([self.digest, search, block])
-            stored = _SCORES.load(key)
-            if stored is None:
-                rng = _generator([self.digest, search, block])
-                score = score_block(self.model, self.gripper, self.searches[search], block, rng)
-                _SCORES.store(key, stored := {"score": score})
+            key, of = [self.digest, search, block], (self.model, self.gripper, self.searches[search], block)
+            stored = _SCORES.computed(file_digest(key), lambda: {"score": score_block(*of, _generator(key))})
             self.scores[search, block] = stored["score"]
         return self.scores[search, block]
 

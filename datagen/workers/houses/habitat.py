@@ -13,9 +13,10 @@ Frame of the files: right-handed, y up; world (x, y, z) = (x, -z, y). Rotations 
 from __future__ import annotations
 
 import hashlib
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -25,7 +26,7 @@ from datagen.schemas.identity import digest_of
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.furniture.asset_geometry import type_of_name
 from datagen.workers.furniture.assets import CARRYING_TYPES
-from datagen.workers.geometry.mesh import F32, F64, Mesh, MeshFile
+from datagen.workers.geometry.mesh import F32, F64, Mesh, MeshFile, transformed_parts
 from datagen.workers.geometry.transforms import rotation_of
 from datagen.workers.houses.glb import read_glb
 from datagen.workers.houses.habitat_checks import (
@@ -118,7 +119,6 @@ class HabitatHouses:
     carrying: frozenset[str] = CARRYING_TYPES | {"Object"}  # types whose flat tops support objects
     statement: Mapping[str, str] = field(default_factory=dict)
     kind: str = "habitat"
-    _templates: OrderedDict[tuple[object, ...], _Template] = field(default_factory=OrderedDict)
 
     def house_ids(self) -> list[str]:
         """Ids, sorted: the scene's path below the root, or the folder of scenes, without its ending."""
@@ -134,7 +134,7 @@ class HabitatHouses:
         scene, text = self._scene(house_id)
         digest = hashlib.sha256(text)
         entry = scene.get("stage_instance")
-        stage = self._template(self._stage_files(entry), is_stage=True)
+        stage = self._template(self._stage_files(entry), True)
         digest.update(stage.digest)
         T_world = (
             _pose(entry, is_stage=True) if self.stage_turn is None else _in_world(self.stage_turn(house_id))
@@ -144,7 +144,7 @@ class HabitatHouses:
         placed: list[tuple[StaticBody, F64, F64, Mesh]] = []
         instances, findings = self._instances(scene)
         for number, name, files, entry, T_world in instances:
-            template = self._template(files)
+            template = self._template(files, False)
             digest.update(template.digest)
             if is_about_centre(entry, scene):
                 centre_m = _centre_m(files, template)
@@ -198,31 +198,16 @@ class HabitatHouses:
         refuse_upside_down(scene, [T for *_, T in found], findings)
         return found, findings
 
-    def _template(self, files: AssetFiles, *, is_stage: bool = False) -> _Template:
-        key = files.mesh, files.collision, files.scale, is_stage
-        if key in self._templates:
-            self._templates.move_to_end(key)
-            return self._templates[key]
-        S = np.diag([*files.scale, 1.0])
-        mesh, digest = read_glb(files.mesh).transformed(_Y_UP_TO_WORLD @ S), file_digest(files.mesh)
-        solid = mesh
-        if files.collision is not None:
-            solid = read_glb(files.collision).transformed(_Y_UP_TO_WORLD @ S)
-            digest = hashlib.sha256(digest + file_digest(files.collision)).digest()
-        if files.scale != (1.0, 1.0, 1.0):
-            digest = hashlib.sha256(digest + S.tobytes()).digest()
-        template = _Template(mesh, () if is_stage else convex_parts(solid), digest)
-        self._templates[key] = template
-        if len(self._templates) > _KEPT_MESHES:
-            self._templates.popitem(last=False)
-        return template
+    @cached_property
+    def _template(self) -> Callable[[AssetFiles, bool], _Template]:
+        return lru_cache(_KEPT_MESHES)(_read_template)
 
     def _placed(
         self, number: int, name: str, files: AssetFiles, template: _Template, T: F64
     ) -> tuple[StaticBody, F64, F64, Mesh]:
         """The body, the point that decides its room, its pose and its mesh in its own frame."""
         mesh = template.mesh.transformed(T)
-        parts = tuple((p @ T[:3, :3].T + T[:3, 3]).astype(np.float32) for p in template.parts_m)
+        parts = transformed_parts(template.parts_m, T)
         size_m = np.ptp(mesh.vertices_m, axis=0)
         object_type = self._type_of(name, files)
         is_small = bool(size_m.max() < _SMALL_M or (mesh.vertices_m[:, 2].min() > 0.2 and size_m.max() < 0.6))
@@ -281,6 +266,18 @@ def open_habitat(place: str) -> HabitatHouses:
     return HabitatHouses(root, digest, scenes, types, find, statement=read_statement(root))
 
 
+def _read_template(files: AssetFiles, is_stage: bool) -> _Template:
+    S = np.diag([*files.scale, 1.0])
+    mesh, digest = read_glb(files.mesh).transformed(_Y_UP_TO_WORLD @ S), file_digest(files.mesh)
+    solid = mesh
+    if files.collision is not None:
+        solid = read_glb(files.collision).transformed(_Y_UP_TO_WORLD @ S)
+        digest = hashlib.sha256(digest + file_digest(files.collision)).digest()
+    if files.scale != (1.0, 1.0, 1.0):
+        digest = hashlib.sha256(digest + S.tobytes()).digest()
+    return _Template(mesh, () if is_stage else convex_parts(solid), digest)
+
+
 def _centre_m(files: AssetFiles, template: _Template) -> F64:
     """The point (3,) of a template, z up, that a scene may place: its configured centre of mass, or the
     centre of its bounding box."""
@@ -293,20 +290,16 @@ def _centre_m(files: AssetFiles, template: _Template) -> F64:
 
 def _pose(entry: JsonNode, *, is_stage: bool = False) -> F64:
     """`T_world_object` of an instance; a stage that states no translation is at the origin."""
-    at = entry.find("translation") if is_stage else entry.get("translation")
-    x, y, z = (0.0, 0.0, 0.0) if at is None else at.numbers(3, -EXTENT_M, EXTENT_M)
-    found = entry.find("rotation")
-    q = np.array([1.0, 0, 0, 0] if found is None else found.numbers(4, -2.0, 2.0))
+    at = entry.given("translation", [0, 0, 0]) if is_stage else entry.get("translation")
+    position_m = at.numbers(3, -EXTENT_M, EXTENT_M)
+    q = np.array(entry.given("rotation", [1, 0, 0, 0]).numbers(4, -2.0, 2.0))
     if not 0.5 < np.linalg.norm(q) < 2.0:
         raise entry.get("rotation").error("is not a unit quaternion")
-    scale = entry.find("uniform_scale")
-    stretched = entry.find("non_uniform_scale")
-    factors = np.full(3, 1.0 if scale is None else scale.number(1e-3, 1e3))
-    if stretched is not None:
-        factors = factors * stretched.numbers(3, 1e-3, 1e3)
+    scale = entry.given("uniform_scale", 1).number(1e-3, 1e3)
+    factors = scale * np.array(entry.given("non_uniform_scale", [1, 1, 1]).numbers(3, 1e-3, 1e3))
     T = np.eye(4)
     T[:3, :3] = rotation_of(q) * factors
-    T[:3, 3] = (x, y, z)
+    T[:3, 3] = position_m
     return _in_world(T)
 
 

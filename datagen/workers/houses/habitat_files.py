@@ -21,7 +21,7 @@ _MAX_FILES = 200_000  # files of one kind
 _MAX_CLASSES = 10_000
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class AssetFiles:
     """The files of a stage or an object; `scale` (3,) is along the mesh's axes."""
 
@@ -60,15 +60,14 @@ def configured_files(config: Path, root: Path) -> AssetFiles:
             raise named.error(f"{named.text()!r} is not below {root}")
         paths.append(path)
     mesh, collision = paths[0] or config.with_name(config.name.split(".")[0] + ".glb"), paths[1]
-    scale = node.find("scale")
     for key, axis in (("up", (0, 1, 0)), ("front", (0, 0, -1))):
-        found = node.find(key)
-        if found is not None and np.abs(np.subtract(found.numbers(3, -1.0, 1.0), axis)).max() > 1e-3:
+        found = node.given(key, [*axis])
+        if np.abs(np.subtract(found.numbers(3, -1.0, 1.0), axis)).max() > 1e-3:
             raise found.error(f"is not {str(axis)[1:-1]}", "Turn the mesh so that y is up and -z its front")
     if collision is not None and (collision.suffix != ".glb" or not collision.is_file()):
         collision = None
-    factors = (1.0, 1.0, 1.0) if scale is None else tuple(scale.numbers(3, 1e-3, 1e3))
-    return AssetFiles(mesh, config, collision, factors)
+    factors = node.given("scale", [1, 1, 1]).numbers(3, 1e-3, 1e3)
+    return AssetFiles(mesh, config, collision, tuple(factors))
 
 
 def config_of(files: AssetFiles) -> JsonNode | None:

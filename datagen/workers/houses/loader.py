@@ -64,9 +64,8 @@ def read_house(root: JsonNode, assets: Mapping[str, Asset]) -> HouseRecord:
 
     Houses of another schema, without walls of any length, or mostly implausible are refused.
     """
-    metadata = root.find("metadata")
-    schema = None if metadata is None else metadata.find("schema")
-    if schema is not None and not schema.text().startswith("1."):
+    schema = root.given("metadata", {}).given("schema", "1.")
+    if not schema.text().startswith("1."):
         raise schema.error(
             f"unknown schema: version {schema.text()!r}, not 1", "Convert the house to version 1."
         )
@@ -75,7 +74,7 @@ def read_house(root: JsonNode, assets: Mapping[str, Asset]) -> HouseRecord:
     rooms, floors = _rooms(root.get("rooms"))
     holes = list[Hole]()
     for name in ("doors", "windows"):
-        holes += _holes(root.find(name), walls, open_walls, name == "doors", findings)
+        holes += _holes(root.given(name, []), walls, open_walls, name == "doors", findings)
     things = read_things(root, assets, findings)
     refuse_implausible(root, things, rooms, len(holes), findings)
     materials = {
@@ -156,8 +155,7 @@ def _walls(node: JsonNode, findings: Counter[str]) -> tuple[dict[str, WallSegmen
         wall_id = entry.get("id").text()
         if wall_id in walls:
             raise entry.get("id").error(f"belongs to two walls: {wall_id!r}")
-        empty = entry.find("empty")
-        if empty is not None and empty.value is True:
+        if entry.given("empty", False).value is True:
             others.add(wall_id)
             continue  # a passage between two rooms, listed as a wall
         outline = entry.get("polygon")
@@ -186,7 +184,7 @@ def _walls(node: JsonNode, findings: Counter[str]) -> tuple[dict[str, WallSegmen
 
 
 def _holes(
-    node: JsonNode | None,
+    node: JsonNode,
     walls: Mapping[str, WallSegment],
     open_walls: set[str],
     is_door: bool,
@@ -194,10 +192,8 @@ def _holes(
 ) -> list[Hole]:
     """Openings, measured along `wall0`, or along `wall1` from its other end if only `wall1` exists."""
     holes: list[Hole] = []
-    if node is None:
-        return holes
     for entry in node.items(MAX_HOLES):
-        wall0, wall1 = entry.get("wall0").text(), _text_or_empty(entry.find("wall1"))
+        wall0, wall1 = entry.get("wall0").text(), entry.given("wall1", "").text()
         outline = entry.get("holePolygon")
         points = [p.point() for p in outline.items(16)]
         if len(points) < 2:
@@ -222,11 +218,7 @@ def _holes(
             raise outline.error(f"a door {top:g} m high")
         if top <= bottom:
             continue
-        room0, room1 = (_text_or_empty(entry.find(k)) for k in ("room0", "room1"))
+        room0, room1 = (entry.given(k, "").text() for k in ("room0", "room1"))
         leads_out = is_door and (room0 == room1 or "exterior" in wall0 or "exterior" in wall1)
         holes.append(Hole(wall.wall_id, (low, high), (bottom, min(top, wall.height_m)), leads_out))
     return holes
-
-
-def _text_or_empty(node: JsonNode | None) -> str:
-    return "" if node is None else node.text()

@@ -151,7 +151,7 @@ def _refuse_others(node: JsonNode, keys: tuple[str, ...]) -> None:
 def _support(node: JsonNode, known: OccupancyMap) -> _Support:
     height_m = node.get("height_m").number(0.1, 3.0)
     _refuse_others(node, _KEYS)
-    name = "support" if (given := node.find("name")) is None else given.text()
+    name = node.given("name", "support").text()
     polygon = node.find("polygon_m")
     if polygon is not None:
         if node.find("centre_m") is not None or node.find("size_m") is not None:
@@ -160,7 +160,7 @@ def _support(node: JsonNode, known: OccupancyMap) -> _Support:
             -1, 2
         )
     else:
-        yaw = 0.0 if (turn := node.find("yaw_deg")) is None else np.deg2rad(turn.number(-360.0, 360.0))
+        yaw = np.deg2rad(node.given("yaw_deg", 0).number(-360.0, 360.0))
         x, y = node.get("centre_m").numbers(2, -EXTENT_M, EXTENT_M)
         half_m = np.array(node.get("size_m").numbers(2, 0.05, 20.0)) / 2
         T = yaw_pose(x, y, 0.0, float(yaw))

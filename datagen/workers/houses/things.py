@@ -6,7 +6,7 @@ An object's `position` is the centre of its bounding box, in Unity's frame (see 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -71,7 +71,8 @@ def read_things(root: JsonNode, assets: Mapping[str, Asset], findings: Counter[s
         xy = np.array([x, z])
         is_upright = tilt_deg <= _UPRIGHT_DEG
         out.append(Thing(_new_id(entry, seen), "furniture", asset, T_asset, xy, is_upright))
-        for child in _children(entry) if own is None else own.carried[entry.get("id").text()]:
+        children = entry.given("children", []).items(MAX_CHILDREN)
+        for child in children if own is None else own.carried[entry.get("id").text()]:
             small = assets.get(child.get("assetId").text())
             if small is None:
                 findings["unknown assets"] += 1
@@ -82,11 +83,6 @@ def read_things(root: JsonNode, assets: Mapping[str, Asset], findings: Counter[s
             is_upright = tilt_deg <= _UPRIGHT_DEG
             out.append(Thing(_new_id(child, seen), "small", small, T, xy, is_upright, above_m))
     return out
-
-
-def _children(entry: JsonNode) -> Iterator[JsonNode]:
-    children = entry.find("children")
-    return iter(()) if children is None else children.items(MAX_CHILDREN)
 
 
 def _new_id(node: JsonNode, seen: set[str]) -> str:

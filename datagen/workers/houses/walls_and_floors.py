@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from datagen.workers.furniture.solids import ColouredSolid, Rgb, join, prism
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.planar import cross
 from datagen.workers.houses.house import StaticBody
 
 MAX_CORNERS = 64
@@ -36,7 +36,7 @@ def clean_polygon(corners_m: F64) -> F64 | str:
         points = without_straight_corners(points)
     if len(points) < 3:
         return "fewer than three different corners"
-    area_m2 = 0.5 * float(_cross(points, np.roll(points, -1, axis=0)).sum())
+    area_m2 = 0.5 * float(cross(points, np.roll(points, -1, axis=0)).sum())
     if abs(area_m2) < _MIN_AREA_M2:
         return f"an area of {abs(area_m2):.4f} m2"
     points = points if area_m2 > 0 else points[::-1]
@@ -46,7 +46,7 @@ def clean_polygon(corners_m: F64) -> F64 | str:
 def without_straight_corners(points_m: F64) -> F64:
     """The corners (K, 2) at which a closed line turns."""
     before, after = points_m - np.roll(points_m, 1, axis=0), np.roll(points_m, -1, axis=0) - points_m
-    turn = _cross(before, after)
+    turn = cross(before, after)
     return points_m[np.abs(turn) > 1e-9 + 1e-6 * np.linalg.norm(before, axis=1)]
 
 
@@ -67,7 +67,7 @@ def floor_solids(polygon_m: F64, rgb: Rgb) -> list[ColouredSolid]:
     slabs: list[ColouredSolid] = []
     for a, b, c in triangles(polygon_m):
         corners = polygon_m[[a, b, c]]
-        if abs(float(_cross(corners[1] - corners[0], corners[2] - corners[0]))) < 1e-6:
+        if abs(float(cross(corners[1] - corners[0], corners[2] - corners[0]))) < 1e-6:
             continue
         top = np.column_stack([corners, np.zeros(3)])
         slabs.append(prism(top - (0.0, 0.0, FLOOR_THICKNESS_M), top, rgb))
@@ -76,25 +76,21 @@ def floor_solids(polygon_m: F64, rgb: Rgb) -> list[ColouredSolid]:
 
 def _is_ear(polygon_m: F64, ring: list[int], i: int) -> bool:
     a, b, c = (polygon_m[ring[k % len(ring)]] for k in (i - 1, i, i + 1))
-    if float(_cross(b - a, c - b)) <= 0:
+    if float(cross(b - a, c - b)) <= 0:
         return False
     others = [k for k in ring if k not in (ring[i - 1], ring[i], ring[(i + 1) % len(ring)])]
     p = polygon_m[others]
-    inside = (_cross(b - a, p - a) >= 0) & (_cross(c - b, p - b) >= 0) & (_cross(a - c, p - c) >= 0)
+    inside = (cross(b - a, p - a) >= 0) & (cross(c - b, p - b) >= 0) & (cross(a - c, p - c) >= 0)
     return not inside.any()
 
 
 def _crosses_itself(points: F64) -> bool:
     start, end = points, np.roll(points, -1, axis=0)
     along = (end - start)[:, None]
-    left = _cross(along, start[None] - start[:, None])
-    right = _cross(along, end[None] - start[:, None])
+    left = cross(along, start[None] - start[:, None])
+    right = cross(along, end[None] - start[:, None])
     straddles = (left * right < 0) & (np.abs(left) > 1e-9) & (np.abs(right) > 1e-9)
     return bool((straddles & straddles.T).any())
-
-
-def _cross(a: F64, b: F64) -> npt.NDArray[np.float64]:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 WALL_THICKNESS_M = 0.02
@@ -173,7 +169,7 @@ def _sort_into(
     key = (round(float(direction[0]) * 500), round(float(direction[1]) * 500))
     for k in buckets[key]:
         line = lines[k][0]
-        offsets = [_cross(line.direction, p - line.origin) for p in (start, end)]
+        offsets = [cross(line.direction, p - line.origin) for p in (start, end)]
         if max(abs(o) for o in offsets) < _SAME_LINE_M:
             lines[k][1].append(wall)
             return

@@ -47,6 +47,14 @@ class KinematicTree(NamedTuple):
         axis = np.tile([0.0, 0.0, 1.0], (len(self.axis), 1))
         return self._replace(T_parent_joint=T_parent_joint, axis=axis, T_joint_frame=T_frame)
 
+    def hand_joints(self) -> list[int]:
+        """The joints that move the last frame, the hand's, from the nearest to the base."""
+        joints, j = list[int](), int(self.frame_joint[-1])
+        while j >= 0:
+            joints.append(j)
+            j = int(self.parent[j])
+        return joints
+
 
 def _z_to(axis: F64) -> F64:
     """A rotation (4, 4) that takes z to the unit axis (3,); the identity for z itself."""

@@ -21,7 +21,7 @@ from datagen.schemas.run_records import StageClock
 from datagen.schemas.specification import ArmParams, DisturbanceParams, Specification
 from datagen.workers.bases.candidates import SceneCandidates, footprint_of
 from datagen.workers.bases.clearance import base_clearance_m
-from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.mesh import F64, transformed
 from datagen.workers.geometry.transforms import inverse, translation, yaw_pose
 from datagen.workers.grasps.grasp_cache import GraspSet, grasps_of
 from datagen.workers.kinematics.tree import Bools
@@ -86,8 +86,7 @@ class ArmInScene:
     @cached_property
     def tcp_positions_m(self) -> F64:
         """World positions (G, 3) of the TCP at all grasps of the target."""
-        T = self.scene.T_world_object[0]
-        return self.grasps.T_object_tcp[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
+        return transformed(self.grasps.T_object_tcp[:, :3, 3], self.scene.T_world_object[0])
 
     def base_pose(self, candidates: SceneCandidates, row: int) -> F64:
         """World pose (4, 4) of the mount at candidate `row`."""

@@ -58,9 +58,7 @@ def arm_links(name: str) -> ArmLinks:
     arm = pose_reach(name, reach_m)
     parts = b"-".join(np.asarray(part).tobytes() for part in (*tree, radius_m, *arm))
     key = f"{sha256(parts).hexdigest()}-{version_of('numpy')}"
-    if (stored := _CACHE.load(key)) is None:
-        _CACHE.store(key, stored := _sampled(tree, radius_m, arm)._asdict())
-    return ArmLinks(**stored)
+    return ArmLinks(**_CACHE.computed(key, lambda: _sampled(tree, radius_m, arm)._asdict()))
 
 
 def _sampled(tree: KinematicTree, radius_m: F64, arm: PoseReach) -> ArmLinks:
@@ -84,9 +82,7 @@ def _sampled(tree: KinematicTree, radius_m: F64, arm: PoseReach) -> ArmLinks:
         seen = np.moveaxis(frame_poses(tree, q[some])[:, :-1, :3, 3], 2, 0)  # (3, M, B)
         seen[:2] -= arm.axis_xy_m[:, None, None]
         centers[some] = np.moveaxis(to_front(azimuth[some, None], seen), 0, 2)
-    way = [int(tree.frame_joint[-1])]  # from the wrist's joint to the first
-    while (parent := int(tree.parent[way[-1]])) >= 0:
-        way.append(parent)
+    way = tree.hand_joints()
     depth = np.zeros(len(tree.parent))
     depth[way[::-1]] = np.arange(1, 1 + len(way)) / len(way)
     upright = int(tree.coordinate[next((j for j in way[::-1] if not tree.slides[j]), way[0])])

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.planar import prism_corners, unit_circle
 from datagen.workers.kinematics.contacts import Parts, parts_of
 from datagen.workers.kinematics.tree import Bools, Ints
 from datagen.workers.motion.arm_motion import Arm
@@ -63,11 +64,7 @@ def on_pedestal(arm: Arm, base_height_m: float, radius_m: float) -> Arm:
     top_m, bottom_m = -_PEDESTAL_GAP_M, -base_height_m
     if top_m <= bottom_m or radius_m <= 0:
         return arm
-    angles = 2 * np.pi * np.arange(_PEDESTAL_SIDES) / _PEDESTAL_SIDES
-    ring = radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    corners = np.concatenate(
-        [np.column_stack([ring, np.full(_PEDESTAL_SIDES, z)]) for z in (bottom_m, top_m)]
-    )
+    corners = prism_corners(radius_m * unit_circle(_PEDESTAL_SIDES), bottom_m, top_m)
     tree, own = arm.tree, arm.own
     frame, part = len(tree.frame_joint), len(own.owner)
     rows = [(a, part) for a in range(part) if tree.frame_joint[own.owner[a]] > 0]

@@ -100,14 +100,6 @@ _new_search = struct(Search)
 
 
 @compiled
-def _is_stuck(arm: Arm, room: Room, T_root: F64, rows: Ints, w: Work) -> bool:
-    """Whether links that no joint moves collide with anything but the floor."""
-    frame_poses(arm.tree, T_root, w.joints, w.frames)
-    scratch = scratch_of(len(arm.fixed.owner), len(room.still.kind))
-    return hits_still(arm.fixed, ONE_SHAPE, w.frames, room.still, rows, FLOOR, 0.0, scratch)
-
-
-@compiled
 def search_at(
     arm: Arm,
     hand: Hand,
@@ -135,8 +127,11 @@ def search_at(
         lift,
         without_path,
     )
-    stuck = _is_stuck(arm, room, T_root, rows, work)
-    return _new_search(arm, hand, room, limits, T_root, rows, stuck, work)
+    frame_poses(arm.tree, T_root, work.joints, work.frames)
+    scratch = scratch_of(len(arm.fixed.owner), still)
+    # Links that no joint moves may touch nothing but the floor.
+    is_stuck = hits_still(arm.fixed, ONE_SHAPE, work.frames, room.still, rows, FLOOR, 0.0, scratch)
+    return _new_search(arm, hand, room, limits, T_root, rows, is_stuck, work)
 
 
 @compiled

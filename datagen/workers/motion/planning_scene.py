@@ -12,9 +12,8 @@ import numpy as np
 from datagen.schemas.specification import MotionParams
 from datagen.workers.bases.clearance import STEP_M
 from datagen.workers.content_cache import CacheFolder
-from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.mesh import F32, F64, transformed
 from datagen.workers.grasps.grasp_cache import GraspSet, content_digest, file_digest
-from datagen.workers.houses.house import House
 from datagen.workers.kinematics.compiler import code_folder, in_memory
 from datagen.workers.kinematics.contacts import Parts, Still, hit_any, parts_of
 from datagen.workers.kinematics.tree import Ints
@@ -141,7 +140,8 @@ def hand_scene(
     """
     target, T_world_target = scene.models[0], scene.T_world_object[0]
     static, floor = _static_around(scene, around_m)
-    objects = [_placed(m, T) for m, T in zip(scene.models, scene.T_world_object, strict=True)]
+    bodies = zip(scene.models, scene.T_world_object, strict=True)
+    objects = [[transformed(part, T) for part in model.convex_parts_m] for model, T in bodies]
     others = [part for parts in objects[1:] for part in parts]
     kinds = [int(FLOOR if f else OTHER) for f in floor]
     kinds += [int(TARGET)] * len(objects[0]) + [int(OTHER)] * len(others)
@@ -157,9 +157,10 @@ def hand_scene(
     first = int(np.searchsorted(grasp, per_scene))
     of_others = np.arange(len(static) + len(objects[0]), len(still.kind))
     of_static = near[near < len(static)]
-    if _is_sunk(target, T_world_target, in_memory(still), of_others) or not _can_be_lifted(
-        target, T_world_target, in_memory(still), of_static, limits.lift_m
-    ):
+    # A target that penetrates another object has no grasp, even where the hand is free.
+    parts, T_target = in_memory(still), np.ascontiguousarray(T_world_target[None, None, :3])
+    is_sunk = hit_any(_core(target, _SUNK_M), T_target, parts, of_others)
+    if is_sunk or not _can_be_lifted(target, T_world_target, parts, of_static, limits.lift_m):
         grasp, T_object_tcp, opening, first = grasp[:0], T_object_tcp[:0], opening[:0], 0
     T_world_tcp = np.ascontiguousarray(np.matmul(T_world_target, T_object_tcp)[:, :3])
     poses = Poses.unknown(T_world_tcp, opening)
@@ -236,13 +237,6 @@ def _core(model: ObjectModel, depth_m: float) -> Parts:
     return known[depth_m]
 
 
-def _is_sunk(target: ObjectModel, T_world_target: F64, still: Still, others: Ints) -> bool:
-    """Whether the target penetrates another object: it has no grasp, even where the hand is free."""
-    return hit_any(
-        _core(target, _SUNK_M), np.ascontiguousarray(T_world_target[None, None, :3]), still, others
-    )
-
-
 def _can_be_lifted(
     target: ObjectModel, T_world_target: F64, still: Still, static: Ints, lift_m: float
 ) -> bool:
@@ -268,29 +262,10 @@ def still_of(parts_m: Sequence[F32 | F64], kinds: Sequence[int]) -> Still:
     return Still(points, first, low, high, np.array(kinds, np.int64))
 
 
-def _placed(model: ObjectModel, T: F64) -> list[F64]:
-    """The world corners of an object's parts, each (V, 3)."""
-    return [part.astype(np.float64) @ T[:3, :3].T + T[:3, 3] for part in model.convex_parts_m]
-
-
 def _static_around(scene: SettledScene, around_m: float) -> tuple[list[F32], list[bool]]:
     """The house's parts within a cube around the target, and which of them a base can stand on."""
-    center = scene.target_center_m
-    parts, low_m, high_m = _house_parts(scene.house.house)
+    center, house = scene.target_center_m, scene.house.house
+    low_m, high_m = house.part_boxes_m
     near = ((low_m < center + around_m) & (high_m > center - around_m)).all(axis=1)
     rows = np.flatnonzero(near)
-    return [parts[k] for k in rows.tolist()], (high_m[rows, 2] <= STEP_M).tolist()
-
-
-_parts_of_houses: WeakKeyDictionary[House, tuple[list[F32], F32, F32]] = WeakKeyDictionary()
-
-
-def _house_parts(house: House) -> tuple[list[F32], F32, F32]:
-    """All convex parts of a house with their boxes, (P, 3) each."""
-    if house not in _parts_of_houses:
-        parts = [part for body in house.bodies for part in body.convex_parts_m]
-        corners = np.concatenate(parts)
-        first = np.cumsum([0, *map(len, parts[:-1])])
-        low, high = (f.reduceat(corners, first) for f in (np.minimum, np.maximum))
-        _parts_of_houses[house] = (parts, low, high)
-    return _parts_of_houses[house]
+    return [house.parts_m[k] for k in rows.tolist()], (high_m[rows, 2] <= STEP_M).tolist()

@@ -231,10 +231,8 @@ def reach_map(tree: KinematicTree, draw: int = 0) -> ReachMap:
     key = (*(a.tobytes() for a in one), turn, draw)
     if key not in _known:
         kept = sha256(repr((code_folder().name, np.__version__, _SAMPLES, _FIRST_SAMPLES, key)).encode())
-        stored = _MAPS.load(kept.hexdigest())
-        if stored is None:
-            stored = _samples(one, turn, _rounded(axis_xy_m / length_m), draw)
-            _MAPS.store(kept.hexdigest(), stored)
+        axis_xy = _rounded(axis_xy_m / length_m)
+        stored = _MAPS.computed(kept.hexdigest(), lambda: _samples(one, turn, axis_xy, draw))
         count = DISTANCES * HEIGHTS * DIRECTIONS * ROLLS * (1 if turn >= 0 else AZIMUTHS)
         first = np.append(0, np.cumsum(np.bincount(stored["cell"], minlength=count))).astype(np.int32)
         _known[key] = first, stored["q"], float(stored["half"]), _near(first)
@@ -309,12 +307,8 @@ def _upright(tree: KinematicTree) -> tuple[int, F64]:
 
     Joints below it may slide up and down; -1 where there is none.
     """
-    way, j = list[int](), int(tree.frame_joint[-1])
-    while j >= 0:
-        way.append(j)
-        j = int(tree.parent[j])
     T = np.eye(4)
-    for j in reversed(way):
+    for j in reversed(tree.hand_joints()):
         T = T @ tree.T_parent_joint[j]
         axis = T[:3, :3] @ tree.axis[j]
         if np.abs(axis[:2]).max() > 1e-6:

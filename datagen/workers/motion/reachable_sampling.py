@@ -100,12 +100,8 @@ def _along_axis(tree: KinematicTree) -> tuple[Bools, tuple[float, float], float]
     Returns their coordinates (A,), and where they bring the hand from their lower limits: the lowest and the
     highest (m), and how far around (rad), clockwise below 0.
     """
-    chain, j = list[int](), int(tree.frame_joint[-1])
-    while j >= 0:
-        chain.append(j)
-        j = int(tree.parent[j])
     T, held, low_m, high_m, turn_rad = np.eye(4), np.zeros(len(tree.lower), np.bool_), 0.0, 0.0, 0.0
-    for j in reversed(chain):
+    for j in reversed(tree.hand_joints()):
         T = T @ tree.T_parent_joint[j]
         z, k = float(T[2, 2]), int(tree.coordinate[j])
         if abs(z) < 1 - 1e-9 or np.count_nonzero(tree.coordinate == k) > 1:

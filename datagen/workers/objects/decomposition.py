@@ -55,10 +55,7 @@ def decompose(surface: Surface, place: str) -> tuple[F32, ...]:
     faces = np.unique(np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1), axis=0)
     key = hashlib.sha256(json.dumps([_SETTINGS, versions_of(["coacd"])]).encode())
     key.update(points.tobytes() + faces.tobytes())
-    stored = _CACHE.load(key.hexdigest())
-    if stored is None:
-        stored = _run({"vertices": points, "faces": faces}, place)
-        _CACHE.store(key.hexdigest(), stored)
+    stored = _CACHE.computed(key.hexdigest(), lambda: _run({"vertices": points, "faces": faces}, place))
     return tuple(stored[f"arr_{k}"].astype(np.float32) for k in range(len(stored)))
 
 

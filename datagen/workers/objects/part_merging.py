@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from scipy.ndimage import map_coordinates
 
-from datagen.workers.content_cache import CacheFolder
+from datagen.workers.content_cache import Arrays, CacheFolder
 from datagen.workers.geometry.mesh import F32
 from datagen.workers.objects.hulls import (
     Hull,
@@ -57,25 +57,20 @@ def merge_parts(parts_m: Sequence[F32], limit: int) -> tuple[F32, ...]:
         return tuple(parts_m)
     key = _key(parts_m, limit)
     if key not in _known:
-        stored = _CACHE.load(key)
-        if stored is None:
-            merged = _merge(parts_m, limit)
-            cuts = np.cumsum([len(part) for part in merged])[:-1]
-            _CACHE.store(key, {"vertices": np.concatenate(merged), "cuts": cuts})
-        else:
-            merged = tuple(np.split(stored["vertices"], stored["cuts"]))
-        _known[key] = merged
+        stored = _CACHE.computed(key, lambda: _merge(parts_m, limit))
+        _known[key] = tuple(np.split(stored["vertices"], stored["cuts"]))
     return _known[key]
 
 
-def _merge(parts_m: Sequence[F32], limit: int) -> tuple[F32, ...]:
+def _merge(parts_m: Sequence[F32], limit: int) -> Arrays:
+    """The vertices of the merged parts, part after part, and the rows where all but the first begin."""
     originals = sorted((hull_of(part) for part in parts_m), key=lambda hull: hull.vertices_m.tobytes())
     merged: list[F32] = []
     for group in _groups(originals, limit):
         whole = hull_of(np.concatenate([originals[k].vertices_m for k in group])).vertices_m
         few = hull_of(few_vertices(whole, MAX_VERTICES)).vertices_m if len(group) > 1 else whole
         merged.append(few.astype(np.float32))
-    return tuple(merged)
+    return {"vertices": np.concatenate(merged), "cuts": np.cumsum([len(part) for part in merged])[:-1]}
 
 
 def _groups(originals: Sequence[Hull], limit: int) -> list[list[int]]:

@@ -64,13 +64,9 @@ def load_scan(files: ScanFiles) -> Scan:
 
     Raises InputError as `read_scan` does; an unusable cache costs only time.
     """
+    paths = files.visual, files.texture, files.collision
     key = f"{files.digest}-{_CACHE_VERSION}"
-    stored = CACHE.load(key)
-    if stored is not None:
-        return restored_scan(stored)
-    scan = read_scan(files.visual, files.texture, files.collision)
-    CACHE.store(key, stored_scan(scan))
-    return scan
+    return restored_scan(CACHE.computed(key, lambda: stored_scan(read_scan(*paths))))
 
 
 def volumes_m3(files: Sequence[ScanFiles]) -> list[float]:
@@ -79,11 +75,10 @@ def volumes_m3(files: Sequence[ScanFiles]) -> list[float]:
     Raises InputError as `read_scan` does.
     """
     key = f"{digest_of([scan.digest for scan in files])}-{_CACHE_VERSION}"
-    stored = _VOLUMES.load(key)
-    if stored is None:
-        stored = {"volumes_m3": np.array([load_scan(scan).parts.volume_m3 for scan in files], np.float64)}
-        _VOLUMES.store(key, stored)
-    return stored["volumes_m3"].tolist()
+    volumes = _VOLUMES.computed(
+        key, lambda: {"volumes_m3": np.array([load_scan(scan).parts.volume_m3 for scan in files], np.float64)}
+    )
+    return volumes["volumes_m3"].tolist()
 
 
 def read_scan(visual: Path, texture: Path, collision: Path) -> Scan:

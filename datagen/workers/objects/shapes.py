@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from datagen.workers.geometry.mesh import F32, F64, Mesh, concatenate
+from datagen.workers.geometry.mesh import F32, F64, Mesh, concatenate, transformed_parts
 
 Rgb = tuple[int, int, int]
 Indices = npt.NDArray[np.int64]
@@ -173,8 +173,7 @@ def moved(
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(turn).as_matrix() @ np.diag(scale)
     T[:3, 3] = offset_m
-    parts = tuple((part @ T[:3, :3].T + T[:3, 3]).astype(np.float32) for part in solid.parts_m)
-    return ParametricSolid(solid.mesh.transformed(T), parts)
+    return ParametricSolid(solid.mesh.transformed(T), transformed_parts(solid.parts_m, T))
 
 
 def joined(*solids: ParametricSolid) -> ParametricSolid:

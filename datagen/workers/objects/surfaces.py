@@ -16,7 +16,7 @@ from PIL import Image
 from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import is_inside, read_regular
 from datagen.workers.extras import how_to_get
-from datagen.workers.geometry.mesh import F64, U8, Mesh, Texture
+from datagen.workers.geometry.mesh import F64, U8, Mesh, Texture, transformed
 from datagen.workers.houses.glb import DAMAGE, MAX_FACES, read_pieces
 from datagen.workers.objects.obj_file import read_obj
 from datagen.workers.objects.texture import (
@@ -53,7 +53,7 @@ class Surface:
 
     def moved(self, T: F64, scale: float | F64 = 1.0) -> Surface:
         """The surface scaled, then moved by T (4, 4); faces of a mirrored one are turned over."""
-        moved = replace(self, vertices=self.vertices * scale @ T[:3, :3].T + T[:3, 3])
+        moved = replace(self, vertices=transformed(self.vertices * scale, T))
         return moved if np.prod(np.broadcast_to(scale, 3)) > 0 else moved.turned()
 
     def turned(self) -> Surface:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.mesh import F32, F64, transformed
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.rendering.embree import MISS, RayMesh, RayScene, nearest, occluded
 
@@ -98,7 +98,7 @@ def _window_rays(
     A pixel outside the image of a polyhedron around the target cannot show it; leaving it out changes
     no count and saves most rays of a long thin target.
     """
-    corners_m = target.around_m @ T_world_target[:3, :3].T + T_world_target[:3, 3]  # (K, 3)
+    corners_m = transformed(target.around_m, T_world_target)  # (K, 3)
     rel = (corners_m - eyes_m[:, None]) @ axes  # (n, K, 3)
     # A corner level with the eye or behind it has no image: then the whole window is cast.
     ahead = (rel[..., 2] > 1e-3).all(1)

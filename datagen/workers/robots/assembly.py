@@ -10,7 +10,8 @@ import numpy as np
 
 from datagen.schemas.identity import digest_of
 from datagen.schemas.safe_files import read_regular
-from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.mesh import F32, F64, transformed
+from datagen.workers.geometry.planar import prism_corners, unit_circle
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.kinematics.tree import KinematicTree
 from datagen.workers.robots.arm_chain import TURN, ArmChain
@@ -196,8 +197,6 @@ def _with_reach(source: RobotSource, found: Assembly) -> Assembly:
 
 
 def _tube(T_flange: F64, length_m: float, rule: ScaleKeys) -> F32:
-    angle = 2 * np.pi * (np.arange(_TUBE_SIDES) + 0.5) / _TUBE_SIDES
     outer = rule.tube_radius_m / np.cos(np.pi / _TUBE_SIDES)  # the prism's sides touch the tube from outside
-    ring = np.stack([outer * np.cos(angle), outer * np.sin(angle), np.zeros(_TUBE_SIDES)], axis=1)
-    points = np.concatenate([ring, ring + (0.0, 0.0, length_m)])
-    return (points @ T_flange[:3, :3].T + T_flange[:3, 3]).astype(np.float32)
+    points = prism_corners(outer * unit_circle(_TUBE_SIDES, 0.5), 0.0, length_m)
+    return transformed(points, T_flange).astype(np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.geometry.planar import crosses_itself, inside_polygon
+from datagen.workers.geometry.planar import crosses_itself, inside_polygon, prism_corners, unit_circle
 from datagen.workers.geometry.transforms import translation
 from datagen.workers.robots.links import LinkBody
 from datagen.workers.robots.robot_file import BaseKeys, RobotSource
@@ -60,8 +60,7 @@ def base_of(source: RobotSource, body: LinkBody, joints: tuple[Joint, ...], turn
         return Base(np.eye(4), None, None, None, None)
     radius_m, outline = keys.radius_m, keys.footprint_m
     if radius_m is not None:
-        angles = 2 * np.pi * np.arange(_CORNERS) / _CORNERS
-        ring = radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        ring = radius_m * unit_circle(_CORNERS)
     else:
         ring = np.zeros((0, 2)) if outline is None else np.array(outline)
     x, y = ring.T
@@ -94,9 +93,8 @@ def base_of(source: RobotSource, body: LinkBody, joints: tuple[Joint, ...], turn
             )
     deck: F32 | None = None
     if not is_in_urdf and height_m > 2 * _GAP_M:
-        levels = (-height_m, min(lowest_m, 0.0) - _GAP_M)
-        rows = [np.column_stack([ring + mount_m[:2], np.full(len(ring), z)]) - axis_m for z in levels]
-        deck = np.concatenate(rows).astype(np.float32)
+        corners = prism_corners(ring + mount_m[:2], -height_m, min(lowest_m, 0.0) - _GAP_M)
+        deck = (corners - axis_m).astype(np.float32)
     outer = BaseKeys(footprint_m=outline, radius_m=radius_m).outer_radius_m
     return Base(translation(*mount_m), height_m, outline, outer, deck)
 
@@ -105,8 +103,7 @@ def _outline(flat: F64) -> Outline:
     """The hull of points (N, 2), of at most `_CORNERS` corners, rounded outwards to millimetres."""
     hull = flat[ConvexHull(flat).vertices]
     if len(hull) > _CORNERS:
-        angles = 2 * np.pi * np.arange(_CORNERS) / _CORNERS
-        normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        normals = unit_circle(_CORNERS)
         far = (hull @ normals.T).max(axis=0)
         following = np.roll(normals, -1, axis=0)
         hull = np.array(

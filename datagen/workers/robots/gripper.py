@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.mesh import F32, F64, transformed
 from datagen.workers.kinematics.tree import Ints, KinematicTree, frame_poses
 
 Parts = tuple[F32, ...]  # convex parts, each (V, 3)
@@ -99,7 +99,7 @@ class Gripper:
         def fingers(k: int, side: int) -> Parts:
             shift = side * known.opening_m[k] / 2 * _Y
             return tuple(
-                (part @ T[k, b, :3, :3].T + T[k, b, :3, 3] - shift).astype(np.float32)
+                (transformed(part, T[k, b]) - shift).astype(np.float32)
                 for b in np.flatnonzero(known.side == side)
                 for part in known.parts_m[b]
             )

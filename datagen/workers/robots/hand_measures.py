@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from datagen.schemas.identity import digest_of
-from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.mesh import F64, transformed, transformed_parts
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.kinematics.tree import Ints, KinematicTree, frame_poses
 from datagen.workers.robots.gripper import Gripper, Linkage, Parts
@@ -118,10 +118,10 @@ class HandMeasures:
             if not (slides and self._meets(pad_size_m)):
                 return self._linkage(name, pad_size_m, q_closed, pads)
         from_palm, parts_m = inverse(self.T_palm_tcp), self._fingers.parts_m
-        palm = tuple(_moved(part, from_palm) for part in parts_m[0])
+        palm = transformed_parts(parts_m[0], from_palm)
         first = 1 if self.side[1] > 0 else 2
         left, right = (
-            tuple(_moved(part, from_palm @ self._tree.T_parent_joint[k - 1]) for part in parts_m[k])
+            transformed_parts(parts_m[k], from_palm @ self._tree.T_parent_joint[k - 1])
             for k in (first, 3 - first)
         )
         opening, depth = float(2 * self._tree.ratio[0]), -max(float(part[:, 2].max()) for part in palm)
@@ -179,7 +179,7 @@ class HandMeasures:
         T = self._poses(q)
         for b in np.flatnonzero(self.side == side).tolist():
             for hull in self._hulls[b]:
-                corners = hull.points[hull.simplices] @ T[b, :3, :3].T + T[b, :3, 3]  # (F, 3, 3)
+                corners = transformed(hull.points[hull.simplices], T[b])  # (F, 3, 3)
                 start, along = corners, np.roll(corners, -1, axis=1) - corners
                 with np.errstate(divide="ignore", invalid="ignore"):
                     ends = np.stack([low - start, high - start])[..., ::2] / along[..., ::2]
@@ -195,7 +195,7 @@ class HandMeasures:
         """The coordinate at which the fingers meet, and points (P, 4) of both pads: x, y, z and body."""
         T = self._poses(0.0)
         corners = [
-            part @ T[b, :3, :3].T + T[b, :3, 3]
+            transformed(part, T[b])
             for b in np.flatnonzero(self.side).tolist()
             for part in self._fingers.parts_m[b]
         ]
@@ -285,8 +285,8 @@ class HandMeasures:
             frame_joint=np.append(tree.frame_joint, -1),
             T_joint_frame=np.stack([np.eye(4), *map(inverse, closed[1:]), np.eye(4)]),
         )
-        parts_m = zip(self._fingers.parts_m, closed, strict=True)
-        parts = tuple(tuple(_moved(part, T) for part in body) for body, T in parts_m)
+        bodies = zip(self._fingers.parts_m, closed, strict=True)
+        parts = tuple(transformed_parts(body, T) for body, T in bodies)
         back = -max(float(part[:, 2].max()) for part in parts[0])
         measured = [opening.tolist(), coordinate.tolist(), depth.tolist()]
         shapes = [[part.tolist() for part in body] for body in parts]
@@ -303,7 +303,3 @@ def _carried(points: F64, before: F64, after: F64) -> F64:
     body = points[:, 3].astype(np.int64)
     T = after @ np.linalg.inv(before)
     return np.einsum("pij,pj->pi", T[body, :3, :3], points[:, :3]) + T[body, :3, 3]
-
-
-def _moved(part: F32, T: F64) -> F32:
-    return (part.astype(np.float64) @ T[:3, :3].T + T[:3, 3]).astype(np.float32)

@@ -22,7 +22,8 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.safe_files import read_regular
 from datagen.workers.content_cache import CacheFolder, version_of
 from datagen.workers.extras import how_to_get
-from datagen.workers.geometry.mesh import F32, F64, I32
+from datagen.workers.geometry.mesh import BOX_BITS, F32, F64, I32, transformed
+from datagen.workers.geometry.planar import prism_corners, unit_circle
 from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.urdf import MOST, Shape
 
@@ -36,12 +37,11 @@ _FIX = "Correct the file, or install its package again"
 _MISSING = "Correct the URDF; package://NAME is a folder NAME above it, or an installed package NAME"
 _FORMATS = (".obj", ".stl", ".dae", ".glb")
 _UNIT = re.compile(rb"""<unit\s[^>]*?\bmeter\s*=\s*["']\s*([0-9.eE+-]+)""")
-_BOX_BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
 _TAKEN_AT_ONCE = 4
 _PUSHES = 50
 _TOUCHING_M = 1e-6
 _MOST_FACES, _SHEET_M, _FLAT_M, _LARGEST_M = 500_000, 0.0005, 5e-7, 20.0
-_RING = np.stack([f(2 * np.pi * (np.arange(16) + 0.5) / 16) for f in (np.cos, np.sin)], axis=1)
+_RING = unit_circle(16, 0.5)
 # Faces, edges and corners of a cube.
 _DIRECTIONS = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 _DIRECTIONS = _DIRECTIONS[np.abs(_DIRECTIONS).sum(axis=1) > 0]
@@ -64,7 +64,7 @@ def shape_parts(shape: Shape, scale: float, cuts_m: tuple[float, ...] = ()) -> P
         cuts = tuple(sorted(height / float(shape.scale[2]) for height in cuts_m))
         hulls = tuple(hull * shape.scale for hull in mesh_hulls(shape.mesh, cuts))
     T = shape.T_link_shape
-    parts = tuple(((hull @ T[:3, :3].T + T[:3, 3]) * scale).astype(np.float32) for hull in hulls)
+    parts = tuple((transformed(hull, T) * scale).astype(np.float32) for hull in hulls)
     if any(map(_is_flat, parts)):
         fix = "Correct it, or leave its link out with arm.ignore"
         raise InputError(shape.path, shape.where, "has no volume", fix)
@@ -90,13 +90,11 @@ def _is_flat(part: F32) -> bool:
 def _solid(size_m: F64) -> F64:
     """Corners (V, 3) of a box, or of prisms around a cylinder (radius, length) or a sphere (radius)."""
     if len(size_m) == 3:
-        return (_BOX_BITS - 0.5) * size_m
+        return (BOX_BITS - 0.5) * size_m
     if len(size_m) == 1:
         return _BALL * size_m[0]
     ring = _RING * (size_m[0] / np.cos(np.pi / len(_RING)))
-    return np.concatenate(
-        [np.column_stack([ring, np.full(len(ring), z)]) for z in size_m[1] / 2 * np.array([-1, 1])]
-    )
+    return prism_corners(ring, -size_m[1] / 2, size_m[1] / 2)
 
 
 @lru_cache(maxsize=512)

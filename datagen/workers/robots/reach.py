@@ -9,7 +9,7 @@ from hashlib import sha256
 import numpy as np
 
 from datagen.workers.content_cache import CacheFolder, version_of
-from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.mesh import F64, transformed
 from datagen.workers.kinematics.tree import KinematicTree, frame_poses
 
 _STARTS = 32
@@ -44,8 +44,7 @@ def largest_reach_m(chain: Chain) -> float:
 def _largest_reach_m(*parts: bytes) -> float:
     """That of a chain's arrays, computed once on a machine."""
     key = f"{sha256(b'-'.join(parts)).hexdigest()}-{version_of('numpy')}"
-    if (stored := _REACHES.load(key)) is None:
-        _REACHES.store(key, stored := {"reach_m": np.array(_ascended_m(*parts))})
+    stored = _REACHES.computed(key, lambda: {"reach_m": np.array(_ascended_m(*parts))})
     return float(stored["reach_m"])
 
 
@@ -62,8 +61,8 @@ def _ascended_m(*parts: bytes) -> float:
         # The TCP in each joint's own frame, before that joint turns: (S, 3) for every joint.
         points = [np.broadcast_to(chain.tcp_m, (_STARTS, 3))]
         for k in range(count - 1, 0, -1):
-            T = chain.T_parent_joint[k]
-            points.append(_turned(points[-1], chain.axis[k], cross[k], q[:, k]) @ T[:3, :3].T + T[:3, 3])
+            turned = _turned(points[-1], chain.axis[k], cross[k], q[:, k])
+            points.append(transformed(turned, chain.T_parent_joint[k]))
         points.reverse()
         shoulder = np.zeros((_STARTS, 3))  # in the frame of joint k, after it has turned
         for k in range(1, count):

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from datagen.schemas.errors import InputError
-from datagen.workers.geometry.mesh import F32, F64, Mesh, concatenate
+from datagen.workers.geometry.mesh import BOX_BITS, F32, F64, Mesh, concatenate
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.houses.glb import read_glb
 from datagen.workers.kinematics import contacts
@@ -261,7 +261,7 @@ def tucked_poses(
         if parts and tree.frame_joint[k] >= 0:
             points = np.concatenate(parts).astype(np.float64)
             low, high = points.min(axis=0), points.max(axis=0)
-            corners.append(np.where((np.arange(8)[:, None] >> np.arange(3)) & 1, high, low))
+            corners.append(np.where(BOX_BITS, high, low))
             rows.append(k)
     boxes = np.array(corners)
 

@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 
 from datagen.schemas.specification import TrialParams
-from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.mesh import F32, F64, transformed_parts
+from datagen.workers.geometry.planar import prism_corners, unit_circle
 from datagen.workers.geometry.transforms import translation
 from datagen.workers.objects.part_merging import merge_parts
 from datagen.workers.robots.links import LinkBody
@@ -105,8 +106,7 @@ def _body(
     parts: list[F32] = []
     mass, moment, about_origin = 0.0, np.zeros(3), np.zeros((3, 3))
     for link, T in rigid:
-        for part in link.parts_m:
-            parts.append((part @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
+        parts += transformed_parts(link.parts_m, T)
         if link.inertial is not None:
             centre = T[:3, :3] @ link.inertial.centre_m + T[:3, 3]
             mass += link.inertial.mass_kg
@@ -184,15 +184,14 @@ def prepare_trials(
 
     `base_radius_m` is that of the pedestal, for robots without a base of their own.
     """
-    still = tuple(part for body in scene.house.house.bodies for part in body.convex_parts_m)
-    low = np.array([part.min(axis=0) for part in still], np.float64).reshape(-1, 3)
-    high = np.array([part.max(axis=0) for part in still], np.float64).reshape(-1, 3)
+    house = scene.house.house
+    low, high = (corners_m.astype(np.float64) for corners_m in house.part_boxes_m)
     return TrialScene(
         robot=robot,
         articulation=articulation_of(robot),
         params=params,
         base_radius_m=base_radius_m,
-        still_parts_m=still,
+        still_parts_m=tuple(house.parts_m),
         still_low_m=low,
         still_high_m=high,
         parts_m=tuple(merge_parts(model.convex_parts_m, params.hulls_per_object) for model in scene.models),
@@ -215,12 +214,8 @@ def pedestal_below(prepared: TrialScene, T_world_base: F64) -> F32 | None:
     if prepared.robot.base_radius_m is not None:
         return None
     x, y, z = T_world_base[:3, 3]
-    angles = 2 * np.pi * np.arange(_PEDESTAL_SIDES) / _PEDESTAL_SIDES
-    ring = np.array([x, y]) + prepared.base_radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    levels = (0.0, z - _PEDESTAL_GAP_M)
-    return np.concatenate([np.c_[ring, np.full(_PEDESTAL_SIDES, level)] for level in levels]).astype(
-        np.float32
-    )
+    ring = np.array([x, y]) + prepared.base_radius_m * unit_circle(_PEDESTAL_SIDES)
+    return prism_corners(ring, 0.0, z - _PEDESTAL_GAP_M).astype(np.float32)
 
 
 def disturbed(prepared: TrialScene, disturbance: Disturbance) -> TrialScene:
