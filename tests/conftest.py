@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from numba.core.dispatcher import Dispatcher
 
+from datagen.workers.kinematics.compiler import code_folder
 from tests.s3_servers import environment, make_bucket, moto_server
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -58,6 +60,29 @@ def session_cache(shared_folder: Path) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DATAGEN_CACHE", str(cache))
         yield cache
+
+
+@pytest.fixture(autouse=True, scope="session")
+def compiled_once(shared_folder: Path, session_cache: Path) -> Iterator[None]:
+    """One worker compiles a function of kinematics or of the planner; others wait and load its code."""
+    assert code_folder.cache_info().currsize == 0, "a file of tests opens a robot where it is imported"
+    whole, depth = Dispatcher.compile, 0
+
+    def compile_alone(dispatcher: Dispatcher, signature: object) -> object:
+        nonlocal depth
+        if depth == 0:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        depth += 1  # a function compiles those that it calls
+        try:
+            return whole(dispatcher, signature)
+        finally:
+            depth -= 1
+            if depth == 0:
+                fcntl.flock(lock, fcntl.LOCK_UN)
+
+    with open(shared_folder / "compiling.lock", "w") as lock, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Dispatcher, "compile", compile_alone)
+        yield
 
 
 @pytest.fixture(scope="session")
