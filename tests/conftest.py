@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gzip
 import os
 import secrets
 import sys
@@ -93,6 +94,20 @@ def real_objects(assets: Path, shared_folder: Path, session_cache: Path) -> str:
     source = f"ycb:{assets / 'ycb'}"
     once(shared_folder / "ycb", lambda: open_objects(source))
     return source
+
+
+@pytest.fixture(scope="session")
+def some_real_houses(assets: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The source of each fortieth real house, for runs: `submit` examines all houses of a source."""
+    folder = tmp_path_factory.mktemp("procthor")
+    (folder / "asset_sizes.json").symlink_to(assets / "procthor" / "asset_sizes.json")
+    lines = [
+        line
+        for file in sorted((assets / "procthor").glob("*.jsonl.gz"))
+        for line in gzip.decompress(file.read_bytes()).splitlines(keepends=True)[::40]
+    ]
+    (folder / "houses.jsonl.gz").write_bytes(gzip.compress(b"".join(lines), 1))
+    return f"procthor:{folder}"
 
 
 @pytest.fixture(autouse=True, scope="module")
