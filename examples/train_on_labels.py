@@ -19,7 +19,7 @@ def ready_made(folder: Path) -> None:
         [folder / "train"],
         val=[folder / "val"],
         out=folder / "model.ckpt",
-        epochs=16,
+        epochs=6,
         device="cpu",
     )
     best = head.history[(head.best_epoch or 1) - 1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gzip
 import os
 import secrets
 import sys
@@ -11,7 +12,9 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from numba.core.dispatcher import Dispatcher
 
+from datagen.workers.kinematics.compiler import code_folder
 from tests.s3_servers import environment, make_bucket, moto_server
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -60,6 +63,29 @@ def session_cache(shared_folder: Path) -> Iterator[Path]:
         yield cache
 
 
+@pytest.fixture(autouse=True, scope="session")
+def compiled_once(shared_folder: Path, session_cache: Path) -> Iterator[None]:
+    """One worker compiles a function of kinematics or of the planner; others wait and load its code."""
+    assert code_folder.cache_info().currsize == 0, "a file of tests opens a robot where it is imported"
+    whole, depth = Dispatcher.compile, 0
+
+    def compile_alone(dispatcher: Dispatcher, signature: object) -> object:
+        nonlocal depth
+        if depth == 0:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        depth += 1  # a function compiles those that it calls
+        try:
+            return whole(dispatcher, signature)
+        finally:
+            depth -= 1
+            if depth == 0:
+                fcntl.flock(lock, fcntl.LOCK_UN)
+
+    with open(shared_folder / "compiling.lock", "w") as lock, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Dispatcher, "compile", compile_alone)
+        yield
+
+
 @pytest.fixture(scope="session")
 def real_objects(assets: Path, shared_folder: Path, session_cache: Path) -> str:
     """The source of the real objects, which the first who asks has read into the cache of all."""
@@ -68,6 +94,20 @@ def real_objects(assets: Path, shared_folder: Path, session_cache: Path) -> str:
     source = f"ycb:{assets / 'ycb'}"
     once(shared_folder / "ycb", lambda: open_objects(source))
     return source
+
+
+@pytest.fixture(scope="session")
+def some_real_houses(assets: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The source of each fortieth real house, for runs: `submit` examines all houses of a source."""
+    folder = tmp_path_factory.mktemp("procthor")
+    (folder / "asset_sizes.json").symlink_to(assets / "procthor" / "asset_sizes.json")
+    lines = [
+        line
+        for file in sorted((assets / "procthor").glob("*.jsonl.gz"))
+        for line in gzip.decompress(file.read_bytes()).splitlines(keepends=True)[::40]
+    ]
+    (folder / "houses.jsonl.gz").write_bytes(gzip.compress(b"".join(lines), 1))
+    return f"procthor:{folder}"
 
 
 @pytest.fixture(autouse=True, scope="module")

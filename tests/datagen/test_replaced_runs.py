@@ -18,7 +18,7 @@ from datagen.schemas.storage import Storage, open_storage
 from tests.datagen.test_resume_s3 import arguments, digests_of
 from tests.small_runs import HERE, PER_SCENE, make_small_run
 
-N = 8 * PER_SCENE
+N = 4 * PER_SCENE
 # Where a function is called during the job, before or in the middle of writing.
 MOMENTS: dict[str, tuple[Any, str]] = {
     "while a shard is made": (datagen.cluster.attempt, "run_shard"),
@@ -48,13 +48,24 @@ def error_of(capture: pytest.CaptureFixture[str], arguments: list[str]) -> str:
     return line
 
 
+@pytest.fixture(scope="module")
+def theirs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The files of the other run."""
+    return content(open_storage(make_small_run(tmp_path_factory.mktemp("theirs") / "run", N, "--seed", "7")))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The run of a job that ends undisturbed."""
+    return Run.open(make_small_run(tmp_path_factory.mktemp("whole") / "run", N))
+
+
 @pytest.mark.parametrize("moment", MOMENTS)
 @pytest.mark.parametrize("kind", ["disk", "s3"])
 def test_a_job_ends_where_another_run_takes_its_folder(
-    kind: str, moment: str, bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    kind: str, moment: str, bucket: str, theirs: dict[str, bytes], whole: Run, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    theirs = content(open_storage(make_small_run(tmp_path / "other", N, "--seed", "7")))
     path = str(tmp_path / "run") if kind == "disk" else f"{bucket}/run"
     ours = dict[str, bytes]()
     place, name = MOMENTS[moment]
@@ -74,7 +85,7 @@ def test_a_job_ends_where_another_run_takes_its_folder(
         assert f"run {Run.open(run).manifest.spec_hash[:12]} of" in told
     assert content(open_storage(path)) == theirs
     assert cli.run(["resume", str(tmp_path / "moved"), *HERE]) == 0
-    assert digests_of(Run.open(moved)) == digests_of(Run.open(make_small_run(tmp_path / "whole", N)))
+    assert digests_of(Run.open(moved)) == digests_of(whole)
 
 
 @pytest.mark.parametrize("moment", ["while a shard is made", "between shards"])

@@ -150,8 +150,7 @@ def inside_outline(point: Array, outline: Array) -> bool:
 def job(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Job:
     houses, objects = "builtin", "builtin"
     if request.param == "real":
-        assets: Path = request.getfixturevalue("assets")
-        houses, objects = f"procthor:{assets / 'procthor'}", request.getfixturevalue("real_objects")
+        houses, objects = map(request.getfixturevalue, ("some_real_houses", "real_objects"))
     folder = tmp_path_factory.mktemp(request.param) / "run"
     config = CONFIG.replace("window_px = 24", f"window_px = {WINDOW_PX}")
     assert config != CONFIG

@@ -199,9 +199,9 @@ def _assert_stored_points(folder: Path, line: dict[str, Any], record: Mapping[st
 
 
 def test_frames_of_real_houses_show_each_object_and_light_changes_no_depth(
-    assets: Path, real_objects: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    some_real_houses: str, real_objects: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    real = ("--houses", f"procthor:{assets / 'procthor'}", "--objects", real_objects)
+    real = ("--houses", some_real_houses, "--objects", real_objects)
     config = "[scene]\nplaces = {shelf = 1, inside = 1}\n"
     run = make_small_run(tmp_path / "run", 2 * PER_SCENE, *real, config=CONFIG + config)
     lines = (export(run, "frames", tmp_path / "out") / "frames.jsonl").read_text().splitlines()

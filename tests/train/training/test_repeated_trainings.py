@@ -34,9 +34,9 @@ KINDS: dict[str, dict[str, Any]] = {
 
 @pytest.fixture(scope="module")
 def one_robot_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """12 scenes, each with 24 candidates of one robot."""
+    """8 scenes, each with 24 candidates of one robot."""
     config = CONFIG + "\n[candidates]\nrobots_per_scene = 1\n"
-    return make_small_run(tmp_path_factory.mktemp("run") / "one", 12 * 24, per_scene=24, config=config)
+    return make_small_run(tmp_path_factory.mktemp("run") / "one", 8 * 24, per_scene=24, config=config)
 
 
 @pytest.fixture

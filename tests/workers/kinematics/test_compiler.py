@@ -45,9 +45,11 @@ def made_inside(n: int) -> float:
 
 def test_structures_keep_their_arrays_though_reading_them_counts_no_reference() -> None:
     n, outers = 100_000, []
+    gc.freeze()  # of all that test processes import, each collection would take a second
     for k in range(20):
         outers.append(in_memory(Outer(Inner(np.full(n, float(k))), np.full(n, 1.0))))
         gc.collect()
+    gc.unfreeze()
     for k, outer in enumerate(outers):
         assert total(outer) == total(outer) == n * (k + 1)
     assert made_inside(n) == 2 * n + 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -29,10 +30,19 @@ from tests.workers.trials.worlds import base_before, on_top_m, plan_from_above, 
 from tests.workers.worlds import TABLE_TOP_M, box_body, box_model
 
 PARAMS = TrialParams()
-ROBOT = open_robot("panda-scaled", 0.8, 0.8)
-BASE = base_before(ROBOT, 0.5)
 UNMOVED = np.eye(4)
 PHASES = ("reach", "approach", "close", "lift", "hold")
+
+
+@cache
+def arm() -> Robot:
+    """Opened by the first test: to import this file takes no compiler."""
+    return open_robot("panda-scaled", 0.8, 0.8)
+
+
+@cache
+def base() -> F64:
+    return base_before(arm(), 0.5)
 
 
 def box(mass_kg: float = 0.3) -> SettledScene:
@@ -45,13 +55,12 @@ def trial(
     scene: SettledScene,
     disturbance: Disturbance | None = None,
     params: TrialParams = PARAMS,
-    base: F64 = BASE,
     plan: MotionPlan | None = None,
     record: bool = False,
 ) -> TrialResult:
-    prepared = prepare_trials(scene, ROBOT, params, 0.1)
-    plan = plan or plan_from_above(ROBOT, BASE, on_top_m(scene, 0.03), 0.07)
-    return run_trial(prepared, base, plan, disturbance or Disturbance.none(params.object_friction), record)
+    prepared = prepare_trials(scene, arm(), params, 0.1)
+    plan = plan or plan_from_above(arm(), base(), on_top_m(scene, 0.03), 0.07)
+    return run_trial(prepared, base(), plan, disturbance or Disturbance.none(params.object_friction), record)
 
 
 def moved(T_target: F64 = UNMOVED, T_base: F64 = UNMOVED) -> Disturbance:
@@ -65,7 +74,7 @@ def test_a_box_is_lifted_and_held_and_the_recording_tells_the_phases_in_order() 
     assert result.lift_m == pytest.approx(0.1, abs=0.005)
     assert result.slip_m < 0.003
     assert result.disturbed_m == 0.0
-    T_world_tcp = BASE @ ROBOT.T_base_tcp(recording.q_rad[-1])
+    T_world_tcp = base() @ arm().T_base_tcp(recording.q_rad[-1])
     top_m = recording.T_world_object[-1, 0, :3, 3] + [0.0, 0.0, 0.06 - 0.03]
     assert np.linalg.norm(T_world_tcp[:3, 3] - top_m) < 0.005
     assert (np.diff(recording.time_s) > 0).all()
@@ -109,7 +118,7 @@ def lifted_by_its_end(length_m: float, mass_kg: float, dx_m: float) -> TrialResu
     """A bar grasped 2 cm from its end."""
     scene = scene_with([box_model("bar", (length_m, 0.04, 0.04), mass_kg)], [(dx_m, 0.0)])
     end_m = on_top_m(scene, 0.02) + [0.02 - length_m / 2, 0.0, 0.0]
-    plan = plan_from_above(ROBOT, BASE, end_m, 0.07)
+    plan = plan_from_above(arm(), base(), end_m, 0.07)
     return trial(scene, Disturbance.none(0.3), plan=plan, record=True)
 
 
@@ -144,10 +153,10 @@ def test_a_thrown_object_makes_the_trial_unstable(
 
 def test_whole_simulation_comes_to_the_same_end() -> None:
     scene = box()
-    plan = plan_from_above(ROBOT, BASE, on_top_m(scene, 0.03), 0.07)
-    prepared = prepare_trials(scene, ROBOT, PARAMS, 0.1)
+    plan = plan_from_above(arm(), base(), on_top_m(scene, 0.03), 0.07)
+    prepared = prepare_trials(scene, arm(), PARAMS, 0.1)
     short, whole = (
-        run_trial(prepared, BASE, plan, Disturbance.none(0.6), record=True, whole=whole)
+        run_trial(prepared, base(), plan, Disturbance.none(0.6), record=True, whole=whole)
         for whole in (False, True)
     )
     assert short.outcome == whole.outcome == "success"
@@ -168,7 +177,7 @@ def test_slip_is_bounded_as_asked() -> None:
 def test_a_hand_that_lands_on_the_target_has_not_reached_its_grasp() -> None:
     """5 cm below its top: the palm stands on it 2 cm too high, with each joint nearly where it should be."""
     scene = box()
-    plan = plan_from_above(ROBOT, BASE, on_top_m(scene, 0.05), 0.07)
+    plan = plan_from_above(arm(), base(), on_top_m(scene, 0.05), 0.07)
     assert trial(scene, plan=plan).outcome == "not_reached"
 
 
