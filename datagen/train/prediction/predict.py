@@ -42,9 +42,9 @@ if TYPE_CHECKING:
     from datagen.train.training.checkpoints import CheckpointHead
 
 _SLACK_M = 0.01  # how far a robot's sizes may be beyond those of the training data
-# Base poses along each side of the grid, 0.08 m apart, and 0.04 m where fewer than enough are good: in narrow
-# gaps of furniture a coarse grid has none. Not where enough can be scored and none is better than hopeless.
-_COARSE, _FINE, _ENOUGH, _HOPELESS = 26, 51, 10, 0.3
+# Base poses along each side of the grid, 0.08 m apart, 0.04 m where fewer than enough are good, 0.02 m where
+# none is: narrow gaps need it. Not where enough can be scored and none is better than hopeless.
+_COARSE, _FINE, _FINEST, _ENOUGH, _HOPELESS = 26, 51, 101, 10, 0.3
 _ALIKE = 0.05  # scores of a model that differ by this or less
 # Poses that far out of reach of the target's centre have scores: it is estimated, and grasps lie around it.
 _BEYOND_M = 0.06
@@ -117,8 +117,9 @@ def predict(
     `target_center_m` (3,), world, replaces the estimated centre. With an `arrival` error the best is the cell
     with the highest expected success; without one, of a model's scores within 0.05 of the highest, the cell
     with the most room. A map of the floor that is `known` is in the frame of the poses of the frames. `grid`
-    cells lie along each side of the square, without it 26, or 51 where few of those are good and not all
-    below 0.3. InputError where arguments are missing or invalid.
+    cells lie along each side of the square, without it 26, or 51 where few of those are good, or 101 where of
+    these one is and of 51 none; not where ten or more have scores and all are below 0.3. InputError where
+    arguments are missing or invalid.
     """
     if is_model := isinstance(scorer, (ModelScorer, ProgramScorer)):
         side_deg = 0.0 - math.degrees(robot.yaw_rad)
@@ -151,10 +152,16 @@ def predict(
         return cells, score, choose(score, cells, allowed, scorer.threshold, arrival, alike)
 
     cells, score, choice = on_grid(_COARSE if grid is None else grid)
-    has_score = score[choice.can_stand & (score > 0)]
-    is_hopeless = len(has_score) >= _ENOUGH and has_score.max() < _HOPELESS
-    if grid is None and len(choice.ranked) < _ENOUGH and not is_hopeless:
+
+    def has_few(enough: int) -> bool:
+        has_score = score[choice.can_stand & (score > 0)]
+        is_hopeless = len(has_score) >= _ENOUGH and has_score.max() < _HOPELESS
+        return grid is None and len(choice.ranked) < enough and not is_hopeless
+
+    if has_few(_ENOUGH):
         cells, score, choice = on_grid(_FINE)
+    if has_few(1) and (found := on_grid(_FINEST))[-1].best is not None:
+        cells, score, choice = found
     read = (note for frame in frames if frame.image is not None for note in frame.image.notes)
     notes = (*read, *_notes(grounds, filled, cloud))
     sizes = (("untrained_size", note) for note in robot_notes(scorer, robot))

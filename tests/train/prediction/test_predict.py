@@ -6,10 +6,11 @@ import re
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
@@ -274,6 +275,33 @@ def test_the_grid_is_fine_where_few_poses_are_good_but_not_all_hopeless(value: f
         Flat(value), frame=[frame], map=[frame / released.MAP], base_height=0.7, reach=0.9
     )
     assert len(answer.score) == side**2
+
+
+@dataclass
+class Spot:
+    """Good within 1.5 cm of one offset from the target, elsewhere neither good nor hopeless."""
+
+    offset_m: F64
+    name, threshold = "spot", 0.5
+
+    def score(self, batch: Batch[Array]) -> F64:
+        off_m = np.linalg.norm(np.asarray(batch.candidates.base_xy_m) - self.offset_m, axis=1)
+        return np.where(off_m < 0.015, 1.0, 0.4)
+
+
+@given(st.floats(-0.04, 0.04), st.floats(-0.04, 0.04))
+@example(0.02, 0.02)
+@settings(max_examples=10, deadline=None)
+def test_a_good_pose_between_those_of_the_fine_grid_is_found(x_m: float, y_m: float) -> None:
+    frame = released.sample_frame()
+    asked: Any = {"frame": [frame], "map": [frame / released.MAP], "base_height": 0.7, "reach": 0.9}
+    roomy = datagen.predict(Flat(), **asked)
+    assert roomy.best is not None
+    spot_m = roomy.cells.offset_m[roomy.best].astype(np.float64) + np.array([x_m, y_m])
+    found, none = (datagen.predict(Spot(each_m), **asked) for each_m in (spot_m, spot_m + 5.0))
+    assert found.best is not None and found.score[found.best] == 1.0
+    assert np.linalg.norm(found.cells.offset_m[found.best] - spot_m) < 0.015
+    assert none.best is None and len(none.score) == 51**2
 
 
 def test_scores_are_of_poses_where_the_base_can_stand_and_the_arm_reaches() -> None:
