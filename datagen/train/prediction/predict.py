@@ -117,9 +117,9 @@ def predict(
     `target_center_m` (3,), world, replaces the estimated centre. With an `arrival` error the best is the cell
     with the highest expected success; without one, of a model's scores within 0.05 of the highest, the cell
     with the most room. A map of the floor that is `known` is in the frame of the poses of the frames. `grid`
-    cells lie along each side of the square, without it 26, or 51 where few of those are good, or 101 where of
-    these one is and of 51 none; not where ten or more have scores and all are below 0.3. InputError where
-    arguments are missing or invalid.
+    cells lie along each side of the square: without it 26; 51 where few of those are good; 101 where none of
+    51 is good and one of 101 is. No finer grid is tried where ten or more have scores and all are below 0.3.
+    InputError where arguments are missing or invalid.
     """
     if is_model := isinstance(scorer, (ModelScorer, ProgramScorer)):
         side_deg = 0.0 - math.degrees(robot.yaw_rad)
