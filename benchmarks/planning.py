@@ -1,9 +1,11 @@
-"""Motion planning over whole grids: labels/s, time by stage, and comparison with mplib.
+"""Motion planning over whole grids: labels/s, time by stage and a configuration, and comparison with mplib.
 
     python -m benchmarks.planning [--houses procthor:DIR] [--objects ycb:DIR] [--scenes 12] [--quick]
     python -m benchmarks.planning --robot panda --peer PYTHON
 
 Times are CPU seconds of this process. Grasps come from the cache if it has them, and are timed separately.
+Configurations, of arm and open hand against the scene and the robot itself, lie around lines between tucked
+poses, at each clear base within reach; compiled code asks for them one by one, as searches do.
 With --peer, the interpreter of an environment with numpy<2 and mplib 0.1.1 plans from the same tucked poses
 to the same pregrasps, among points on the surfaces of the same scenes. mplib's plan is one path with its
 timing; a plan of this project is path, approach and lift, and includes the choice of the grasp.
@@ -19,7 +21,9 @@ from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
+from numpy.random import Generator
 
 from benchmarks.options import scene_options
 from datagen.configuration.specify import specify
@@ -32,7 +36,9 @@ from datagen.workers.geometry.transforms import inverse, quaternion_wxyz, yaw_po
 from datagen.workers.grasps.grasp_cache import grasps_of
 from datagen.workers.houses import open_houses
 from datagen.workers.motion import PlanReport
-from datagen.workers.motion.plan_candidate import plan_candidate
+from datagen.workers.motion.arm_motion import Search, is_blocked
+from datagen.workers.motion.hand_motion import NOTHING
+from datagen.workers.motion.plan_candidate import _Search, plan_candidate  # pyright: ignore
 from datagen.workers.motion.planning_scene import PlanningScene, prepare
 from datagen.workers.objects import open_objects
 from datagen.workers.robots import open_robot, robot_limits
@@ -43,6 +49,7 @@ from datagen.workers.world import World, assemble_world
 
 _POINTS = 8000  # a scene's cloud, for the peer
 _RESOLUTION_M = 0.02
+_CONFIGURATIONS = 100  # of a candidate
 
 
 class Spent:
@@ -52,6 +59,7 @@ class Spent:
         self.stage_s: dict[str, float] = defaultdict(float)
         self.outcome_s: dict[str, float] = defaultdict(float)
         self.outcomes = Counter[str]()
+        self.configuration_s, self.configurations, self.blocked = 0.0, 0, 0
 
 
 def main() -> None:
@@ -102,9 +110,11 @@ def _plan_grid(
         spent.stage_s[stage] += time.process_time() - start_s
 
     start_s = time.process_time()
-    fixed = robot_limits(options.robot).reach_m
-    reach_m = float(np.clip(candidates.arm_reach_m[0], *fixed))
+    limits = robot_limits(options.robot)
+    reach_m = float(np.clip(candidates.arm_reach_m[0], *limits.reach_m))
     height_m = float(candidates.base_height_m[0])
+    if limits.base_height_m is not None:
+        height_m = float(np.clip(height_m, *limits.base_height_m))
     robot = open_robot(options.robot, reach_m, height_m)
     measured("robot", start_s)
     start_s = time.process_time()
@@ -123,6 +133,8 @@ def _plan_grid(
             outcome, report = _outcome(prepared, T_world_base, options.seed, scene, row)
             measured("plan", start_s)
             spent.outcome_s[outcome] += time.process_time() - start_s
+            if outcome not in ("no_grasp", "out_of_reach"):
+                _time_configurations(prepared, T_world_base, np.random.default_rng([scene.index, row]), spent)
             if report is not None and report.plan is not None and options.peer:
                 T = robot.T_base_tcp(report.plan.q_reach_rad[-1])
                 pose = [*T[:3, 3].tolist(), *quaternion_wxyz(T[:3, :3]).tolist()]
@@ -146,6 +158,27 @@ def _outcome(
     rng = generator(seed, Stream.PATH, scene.index, scene.retry, row)
     report = plan_candidate(prepared, T_world_base, rng)
     return report.outcome, report
+
+
+def _time_configurations(prepared: PlanningScene, T_world_base: F64, rng: Generator, spent: Spent) -> None:
+    robot = prepared.robot
+    a, b = robot.homes_rad[rng.integers(0, len(robot.homes_rad), (2, _CONFIGURATIONS))]
+    q = a + rng.uniform(size=(len(a), 1)) * (b - a) + rng.normal(0, 0.5, a.shape)
+    q = np.clip(q, robot.q_lower_rad, robot.q_upper_rad)
+    search = _Search(prepared, np.ascontiguousarray(T_world_base[:3]), rng).compiled
+    _count_blocked(search, q[:1])  # compiled
+    start_s = time.perf_counter()
+    spent.blocked += _count_blocked(search, q)
+    spent.configuration_s += time.perf_counter() - start_s
+    spent.configurations += len(q)
+
+
+@numba.njit(error_model="numpy")
+def _count_blocked(search: Search, q: F64) -> int:
+    count = 0
+    for k in range(len(q)):
+        count += is_blocked(search, q[k], 0, NOTHING)
+    return count
 
 
 def _surface_points(scene: Scene, T_world_base: F64, reach_m: float) -> F64:
@@ -183,6 +216,9 @@ def _print_split(spent: Spent) -> None:
     for outcome, count in spent.outcomes.most_common():
         ms = 1e3 * spent.outcome_s[outcome] / count
         print(f"  {outcome:15s} {count:9d} {count / labels:7.1%} {ms:9.2f}")
+    us = 1e6 * spent.configuration_s / spent.configurations
+    share = spent.blocked / spent.configurations
+    print(f"{spent.configurations:,} configurations, {share:.0%} of them blocked: {us:.2f} us each")
 
 
 def _print_peer(python: str, problems: list[dict[str, Any]], spent: Spent) -> None:

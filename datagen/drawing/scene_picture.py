@@ -149,11 +149,8 @@ def _facts(shown: Shown) -> Lines:
     record, models, samples = shown.rows.record, shown.recalled.models, shown.samples
     height_m = float(np.asarray(record["T_world_support"])[2, 3])
     rejected = zip(REDRAW_CAUSES, np.asarray(record["redraws"]), strict=True)
-    robots, rows = np.unique(np.asarray(samples["robot_index"]), return_index=True)
-    sizes = [
-        f"reach {samples['arm_reach_m'][row]:.2f} m, mount {samples['base_height_m'][row]:.2f} m high"
-        for row in rows[:_MOST_ROBOTS]
-    ]
+    sizes = zip(samples["arm_reach_m"], samples["base_height_m"], strict=True)
+    robots = list(dict.fromkeys(f"reach {r:.2f} m, mount {h:.2f} m high" for r, h in sizes))
     more = [f"and {len(robots) - _MOST_ROBOTS} more"] if len(robots) > _MOST_ROBOTS else []
     return [
         ("house", f"{record['house_id']}, {record['room_type']}"),
@@ -162,5 +159,5 @@ def _facts(shown: Shown) -> Lines:
         ("clutter", ", ".join(m.name for m in models[1:]) or "none"),
         ("settled", f"in {int(record['settle_steps'])} steps"),
         ("rejected tries", ", ".join(f"{cause} {n}" for cause, n in rejected if n) or "none"),
-        *((f"robot {k}" if k < _MOST_ROBOTS else "", text) for k, text in enumerate([*sizes, *more])),
+        *(("" if k else "robot", text) for k, text in enumerate([*robots[:_MOST_ROBOTS], *more])),
     ]

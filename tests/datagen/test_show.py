@@ -55,18 +55,19 @@ def test_a_scene_is_drawn_with_its_outcomes(name: str, paired: dict[str, Path], 
         assert (outcome_map == colour).all(axis=2).sum() > 5, NAMES[code]
 
 
-@pytest.mark.parametrize("outcomes", [1, 4, len(NAMES)])
+@pytest.mark.parametrize(("outcomes", "robots"), [(1, 1), (4, 4), (len(NAMES), 6)])
 def test_no_text_of_a_picture_lies_on_another(
-    outcomes: int, paired: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    outcomes: int, robots: int, paired: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Four robots, long names of objects, and up to all outcomes, with bases that fit and that do not."""
+    """Robots of some sizes, long names of objects, and up to all outcomes, with bases that fit or do not."""
     run = Run.open(str(paired["plan"]))
     rows = read_scene(run, 0)
     n, spec = 2 * len(NAMES), run.manifest.spec
     samples = {name: np.resize(values, (n, *values.shape[1:])) for name, values in rows.samples.items()}
     samples["outcome"] = (np.arange(n) // 2 % outcomes).astype(np.uint8)
     samples["base_is_clear"] = np.arange(n) % 2 == 0
-    samples["robot_index"] = np.arange(n) % 4
+    samples["robot_index"] = np.arange(n) % 6
+    samples["arm_reach_m"] = 0.5 + 0.1 * (np.arange(n) % robots)
     scene = reconstruct_scene(open_world(spec, "builtin", "builtin"), rows.record)
     drawn: list[Figure] = []
     monkeypatch.setattr("datagen.drawing.scene_picture.save_sheet", lambda figure, out: drawn.append(figure))
@@ -75,6 +76,7 @@ def test_no_text_of_a_picture_lies_on_another(
     figure.canvas.draw()
     lower = figure.subfigs[1]
     facts = Bbox.union([text.get_window_extent() for text in lower.axes[0].texts])
+    assert sum(text.get_text().startswith("reach") for text in lower.axes[0].texts) == min(robots, 4)
     legend = lower.axes[1].get_legend().get_window_extent()
     plans = [axes.get_tightbbox() for axes in figure.subfigs[0].axes]
     for box in (facts, legend):

@@ -27,13 +27,14 @@ def search_at(ready: PlanningScene, base: F64) -> Search:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_configurations_are_blocked_where_the_judge_says_so(case: Case) -> None:
+@pytest.mark.parametrize("count", [24, pytest.param(1700, marks=pytest.mark.slow)])
+def test_configurations_are_blocked_where_the_judge_says_so(case: Case, count: int) -> None:
     robot = opened(case)
     scene = table_scene(clutter=CLUTTER)
     ready, base = prepared(scene, robot), front_base(scene, robot, away_m=max(0.45, 0.5 * robot.reach_m))
     at, judge, rng = search_at(ready, base), SceneJudge(scene, robot, base), np.random.default_rng(4)
     openings, margin_m, seen = ready.around.opening_m, PARAMS.margin_m, list[bool]()
-    for k in range(24):
+    for k in range(count):
         a, b = robot.homes_rad[rng.integers(0, len(robot.homes_rad), 2)]
         q = a + rng.uniform() * (b - a) + rng.normal(0, 0.5, len(a))
         q = np.clip(q, robot.q_lower_rad, robot.q_upper_rad)
