@@ -29,6 +29,9 @@ else:
     Frames, Maps, Checkpoint, Outline = Sequence[Path], Sequence[Path], str | Path, str
 
 UNSET = Parameter(show_default=False)  # an empty list says nothing
+OUTLINE = Parameter(  # corners may begin with a minus
+    converter=lambda kind, tokens: tokens[0].value, n_tokens=1, metavar="STR", allow_leading_hyphen=True
+)
 _LARGEST_M = 10.0
 
 
@@ -109,9 +112,7 @@ class PredictOptions:
         Parameter(converter=_numbers, n_tokens=1, metavar="STR", allow_leading_hyphen=True),
     ] = None
     robot_camera_height: float | None = None
-    footprint: Annotated[
-        Outline | None, Parameter(converter=lambda kind, tokens: tokens[0].value, n_tokens=1, metavar="STR")
-    ] = None
+    footprint: Annotated[Outline | None, OUTLINE] = None
     depth_scale: float | None = None
     allow_unseen: bool = False
     map: Annotated[Maps, UNSET] = ()

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from datagen.commands.predict import predict, refuse_robot
-from datagen.commands.predict_options import UNSET, PredictOptions
+from datagen.commands.predict_options import OUTLINE, UNSET, PredictOptions
 from datagen.console.command_lines import options_of
 from datagen.console.options import File
 from datagen.display.progress import Progress
@@ -52,7 +52,7 @@ class ServeOptions:
     robot: str | None = None
     base_height: float | None = None
     reach: float | None = None
-    footprint: str | None = None
+    footprint: Annotated[str | None, OUTLINE] = None
     map: Annotated[Sequence[Path], UNSET] = ()
     keep_out: Annotated[Sequence[Path], UNSET] = ()
     host: str = "127.0.0.1"

@@ -12,7 +12,14 @@ from scipy.spatial import KDTree
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import CandidateParams
-from datagen.train.baselines.baseline import labels, mount_m, observed_rho, planar_distance_m, reach_m
+from datagen.train.baselines.baseline import (
+    labels,
+    mount_m,
+    observed_rho,
+    planar_distance_m,
+    reach_m,
+    refitted_cut,
+)
 from datagen.train.inputs import F64, Array, Batch, Bools, Ints, column, is_clear
 
 FEATURES = (
@@ -32,8 +39,8 @@ class Scalars:
     seed: int = 0
     steps: int = 6000  # at most
     layers: tuple[Layer, ...] = ()  # the first takes the features as they are
+    threshold: float = 0.5  # `fit` sets it for the best balanced accuracy of feasible candidates
     name = "scalars"
-    threshold = 0.5
 
     @property
     def needs_fit(self) -> bool:
@@ -63,10 +70,15 @@ class Scalars:
         rows = np.concatenate([features(b) for b in batches])[clear]
         rng = np.random.default_rng(self.seed)
         held_out = _parts(batches, clear, rng)
-        return replace(self, layers=fit_networks(rows, label[clear], held_out, rng, self.steps))
+        fitted = replace(self, layers=fit_networks(rows, label[clear], held_out, rng, self.steps))
+        return replace(fitted, threshold=refitted_cut(fitted, batches, self.threshold))
 
     def state(self) -> dict[str, Any]:
-        return {"features": FEATURES, "layers": [[w.tolist(), b.tolist()] for w, b in self.layers]}
+        return {
+            "threshold": self.threshold,
+            "features": FEATURES,
+            "layers": [[w.tolist(), b.tolist()] for w, b in self.layers],
+        }
 
 
 def features(batch: Batch[Array]) -> F64:

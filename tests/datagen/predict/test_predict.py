@@ -205,8 +205,11 @@ def test_a_model_that_knows_kinematics_scores_the_named_robot(
     assert len({tuple(each) for each in named}) == len(named)
 
 
-def test_a_frame_without_a_clear_place_ends_with_1(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(arguments(made, "--footprint", "2")) == 1
+@pytest.mark.parametrize("base", ["2", "-2,-2;2,-2;2,2;-2,2"])
+def test_a_frame_without_a_clear_place_ends_with_1(
+    base: str, made: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(arguments(made, "--footprint", base)) == 1
     told = capsys.readouterr().out
     assert "none; no clear base pose was observed" in told and "0 clear" in told
 

@@ -167,6 +167,7 @@ def test_the_service_goes_on_after_a_worker_was_killed(seen: Seen) -> None:
         (("--robot", "fetchh"), "fetchh: is unknown"),
         (("--base-height", "-1", "--reach", "0.9"), "--base-height"),
         (("--robot", "fetch", "--footprint", "x"), "footprint"),
+        (("--robot", "fetch", "--footprint", "-1,0;1,0"), "--footprint: is not 3 to 256 corners"),
         (("--robot", "fetch", "--port", "99999"), "--port: 99999: is not between 1 and 65535"),
         (("--robot", "fetch", "--port", "{taken}"), "cannot be listened on"),
     ],
