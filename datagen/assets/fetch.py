@@ -137,7 +137,8 @@ def unpack(archive: Path, folder: Path) -> int:
     """Unpack the files of a zip or tar into `folder`, over those of the same names; return their number.
 
     They are moved when the whole archive is unpacked, so that a damaged one leaves nothing. No name leads out
-    of the folder, and links and devices are left out. Raises InputError for a damaged archive.
+    of the folder, and links and devices are left out. Raises InputError for an archive that is damaged or
+    without a file, and removes it: the next fetch downloads it again.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".unpack-", dir=folder) as staging:
@@ -147,10 +148,12 @@ def unpack(archive: Path, folder: Path) -> int:
                     packed.extractall(staging)
             else:
                 _unpack_tar(archive, Path(staging))
+            if not (files := [path for path in Path(staging).rglob("*") if path.is_file()]):
+                raise tarfile.ReadError("it has no file")
         except (tarfile.TarError, *DAMAGED_ZIP) as error:
-            fix = "Remove it from the cache and fetch it again"
-            raise InputError(archive, "", f"cannot be unpacked: {error}", fix) from error
-        files = [path for path in Path(staging).rglob("*") if path.is_file()]
+            archive.unlink(missing_ok=True)
+            fix = "Fetch it again, or give another --mirror"
+            raise InputError(archive, "", f"cannot be unpacked, and is removed: {error}", fix) from error
         for file in files:
             target = folder / file.relative_to(staging)
             target.parent.mkdir(parents=True, exist_ok=True)

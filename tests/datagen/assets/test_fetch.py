@@ -194,6 +194,14 @@ def test_a_spoilt_cache_is_fetched_again_and_a_kept_download_used_again(site: Si
     assert fetch(asset, tmp_path / "other", cache=tmp_path / "c").from_cache  # without the mirror
 
 
+def test_a_page_in_place_of_an_archive_is_not_kept(site: Site, tmp_path: Path) -> None:
+    site.files["/toy.zip"] = b"<html>Log in to use this network</html>"
+    with pytest.raises(InputError, match="cannot be unpacked, and is removed"):
+        fetch(_asset(), tmp_path / "out", cache=tmp_path / "c", mirror=site.url)
+    site.files["/toy.zip"] = _zip({"a.txt": b"hello"})
+    assert fetch(_asset(), tmp_path / "out", cache=tmp_path / "c", mirror=site.url).files == 1
+
+
 def test_the_catalogue_is_whole() -> None:
     assert len({asset.file for asset in CATALOGUE.values()}) == len(CATALOGUE)
     for asset in CATALOGUE.values():

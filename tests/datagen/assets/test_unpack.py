@@ -58,6 +58,7 @@ DAMAGED: dict[str, Callable[[], bytes]] = {
     "zip, bad checksum": lambda: _zip("a", b"hello").replace(b"\xcbH\xcd\xc9\xc9", b"\xcbH\xcd\xc9\xc8"),
     "no archive": lambda: b"hello world" * 100,
     "empty file": lambda: b"",
+    "tar, links alone": lambda: _tar(("a", b"", tarfile.SYMTYPE, "b")),
 }
 
 
@@ -67,7 +68,7 @@ def test_no_archive_reaches_out_of_the_folder(case: str, tmp_path: Path) -> None
     archive.write_bytes(OUTSIDE[case]())
     with suppress(InputError):
         unpack(archive, folder)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["archive.bin", "in"]
+    assert {"in"} <= {p.name for p in tmp_path.iterdir()} <= {"archive.bin", "in"}
     assert [p.name for p in folder.parent.iterdir()] == ["folder"]
     assert not any(p.is_symlink() or not (p.is_file() or p.is_dir()) for p in folder.rglob("*"))
 
@@ -79,6 +80,7 @@ def test_damaged_archives_are_refused_and_leave_nothing(case: str, tmp_path: Pat
     with pytest.raises(InputError) as caught:
         unpack(archive, folder)
     assert str(archive) in str(caught.value) and list(folder.iterdir()) == []
+    assert not archive.exists()
 
 
 @pytest.mark.parametrize("packed", [True, False])
