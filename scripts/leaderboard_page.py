@@ -81,7 +81,7 @@ def entry_of(report: dict[str, Any], method: str, about: str) -> tuple[Path, dic
         "about": about,
         "benchmark": benchmark["digest"],
         "checkpoint_sha256": checkpoint and checkpoint["sha256"],
-        "fitted_on": (report["fitted_on"] or None) if found.get("state") or checkpoint else None,
+        "fitted_on": report["fitted_on"] if found.get("state") else None,
         "grids": grids,
         "decisions": decisions,
     }

@@ -99,7 +99,7 @@ def score(
         methods: Methods to compare.
         runs: Folder with the runs of `datagen benchmark make`, or a pack; runs that it lacks are not scored.
             [default: the pack that comes with datagen]
-        fit: Run in validation houses to fit baselines and the models' thresholds on; repeat for more.
+        fit: Run in validation houses to fit baselines on; repeat for more.
         out: File to write, FILE.json.
     """
     from datagen.evaluation.benchmark import (

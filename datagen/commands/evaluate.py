@@ -50,7 +50,7 @@ def evaluate(
 
     Args:
         paths: Checkpoints of `datagen train`, or `released`, and runs of sim or plan labels.
-        fit: Run in validation houses to fit baselines and the models' thresholds on; repeat for more.
+        fit: Run in validation houses to fit baselines on; repeat for more.
         baselines: Baseline to compare with, or none; repeat for more. [default: all]
         heuristic: Parameters of the analytic baseline, from `datagen calibrate`.
         arrival: Arrival error: normal:M[,YAW], disc:M[,YAW] or nav2. [default: 0 to 25 cm]
@@ -77,7 +77,6 @@ def evaluate(
     from datagen.evaluation.methods import (
         baseline_methods,
         open_models,
-        read_fit,
         read_heuristic,
         refuse_seen_houses,
         score_runs,
@@ -97,13 +96,12 @@ def evaluate(
     if arrivals and closed_loop is None and not any(run.cells for run in runs):
         fix = "Name a run of --candidates-per-scene grid, or omit it"
         raise InputError("--arrival", "", "is for picks on whole grids, which no run has", fix)
-    fitted_on = [str(path) for path in fit or ()]
-    fit_runs = read_fit(fitted_on, runs, allow_seen_houses)
-    models = open_models(checkpoints, runs, fit_runs)
+    models = open_models(checkpoints, runs)
     if not allow_seen_houses:
         refuse_seen_houses(runs, models)
     rule = None if heuristic is None else read_heuristic(Path(heuristic), runs, allow_seen_houses)
-    plain = baseline_methods(baselines, fit_runs, runs, rule, json)
+    fitted_on = [str(path) for path in fit or ()]
+    plain = baseline_methods(baselines, fitted_on, runs, rule, allow_seen_houses, json)
     if rule is not None and all(method.name != "analytic" for method in plain.baselines):
         fix = "Give --baselines analytic too, or omit it"
         raise InputError("--heuristic", str(heuristic), "is for the baseline analytic alone", fix)
@@ -112,7 +110,7 @@ def evaluate(
         fix = "Name a checkpoint, or omit --baselines"
         raise InputError("datagen evaluate", "PATH", "no model or baseline given", fix)
     columns, seconds = score_runs(runs, methods, json)
-    seen = fit_runs.houses.union(*(model.houses for model in models))
+    seen = plain.houses.union(*(model.houses for model in models))
     parts = parts_by_houses(columns, seen, candidate_sets_of(runs))
     report = evaluation_report(seconds, methods, runs, parts, fitted_on, plain.left_out, arrivals)
     if closed_loop is not None:

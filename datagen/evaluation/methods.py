@@ -27,10 +27,9 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
 from datagen.schemas.specification import HeuristicParams
 from datagen.train.baselines import BASELINES, fit_baselines, make_baselines
-from datagen.train.baselines.baseline import Calibration, calibrate, refitted_cut
+from datagen.train.baselines.baseline import Calibration, calibrate
 from datagen.train.baselines.scalars import Scalars
 from datagen.train.headings import refuse_other_heading, side_deg_of, trained_side_deg
-from datagen.train.inputs import Array, Batch
 from datagen.train.program_scorer import ProgramScorer
 from datagen.train.run_parts import read_robots, refuse_twins, specs_of
 from datagen.train.scorers import ModelScorer, Scorer, weights_sha256
@@ -50,8 +49,8 @@ REGIMES = {"stage1": "stage1", "sim-only": "sim-only", "stage2": "two-stage"}
 class EvaluatedMethod:
     """One method and its origin.
 
-    Models have a path, a checkpoint and, with --fit, a fitted threshold in place of their scorer's. Baselines
-    have a state and, if they are fitted, a calibration. `note` is printed with the method's name.
+    Models have a path and a checkpoint. Baselines have a state and, if they are fitted, a calibration. `note`
+    is printed with the method's name.
     """
 
     name: str
@@ -61,11 +60,6 @@ class EvaluatedMethod:
     state: Mapping[str, Any] = field(default_factory=dict)
     note: str = ""
     calibration: Calibration | None = None
-    fitted_threshold: float | None = None
-
-    @property
-    def threshold(self) -> float:
-        return self.scorer.threshold if self.fitted_threshold is None else self.fitted_threshold
 
     @property
     def regime(self) -> str:
@@ -100,7 +94,9 @@ class EvaluatedMethod:
         is_probability = isinstance(self.scorer, (ModelScorer, ProgramScorer, Scalars)) or (
             isinstance(self.scorer, ScoreFile) and self.scorer.gives_probabilities
         )
-        return Method(self.name, self.threshold, self.origin, is_probability, self.calibration, self.recipe)
+        return Method(
+            self.name, self.scorer.threshold, self.origin, is_probability, self.calibration, self.recipe
+        )
 
     @property
     def houses(self) -> frozenset[str]:
@@ -117,7 +113,7 @@ class EvaluatedMethod:
         base = {
             "name": self.name,
             "regime": self.regime or None,
-            "threshold": None if self.method.only_picks else self.threshold,
+            "threshold": None if self.method.only_picks else self.scorer.threshold,
             "note": self.note or None,
         }
         if self.head is None:
@@ -139,38 +135,12 @@ class EvaluatedMethod:
 
 
 @dataclass(frozen=True, eq=False)
-class FitRuns:
-    """The runs that --fit names: baselines are fitted on them, and thresholds of models."""
-
-    runs: Sequence[EvaluatedRun] = ()
-    batches: Sequence[Batch[Array]] = ()
-
-    @property
-    def houses(self) -> frozenset[str]:
-        return frozenset[str]().union(*(run.stream.house_ids() for run in self.runs))
-
-
-NO_FIT = FitRuns()
-
-
-def read_fit(fit: Sequence[str], runs: Sequence[EvaluatedRun], allow_seen_houses: bool = False) -> FitRuns:
-    """InputError where `fit` and `runs` share a house, and where trials are missing."""
-    for path in fit:
-        refuse_no_trials(path)
-    fitted = [EvaluatedRun(path, specs_of(path), stream_of([path])) for path in fit]
-    refuse_twins([summary.part for each in fitted for summary in each.stream.parts])
-    if not allow_seen_houses:
-        for each, run in product(fitted, runs):
-            refuse_shared_houses(each.stream, run.stream)
-    return FitRuns(fitted, [batch for each in fitted for batch in each.batches()])
-
-
-@dataclass(frozen=True, eq=False)
 class BaselineMethods:
-    """Baselines in their order, and those omitted with the reason."""
+    """Baselines in their order, those omitted with the reason, and the houses they were fitted on."""
 
     baselines: tuple[EvaluatedMethod, ...]
     left_out: dict[str, str]
+    houses: frozenset[str]
 
 
 def read_heuristic(path: Path, runs: Sequence[EvaluatedRun], allow_seen_houses: bool) -> HeuristicParams:
@@ -192,33 +162,46 @@ def read_heuristic(path: Path, runs: Sequence[EvaluatedRun], allow_seen_houses: 
 
 def baseline_methods(
     requested: Sequence[str] | None,
-    fit: FitRuns,
+    fit: Sequence[str],
     runs: Sequence[EvaluatedRun],
     heuristic: HeuristicParams | None = None,
+    allow_seen_houses: bool = False,
     json: bool = False,
 ) -> BaselineMethods:
     """Return the requested baselines; for None all, except those that need --fit where `fit` is empty.
 
-    InputError where a requested one is not available.
+    InputError where a requested one is not available, or where `fit` and `runs` share a house.
     """
     if requested and NONE in requested:
         if len(requested) > 1:
             raise InputError("--baselines", NONE, "is given with others", "Give only none, or omit it")
-        return BaselineMethods((), {})
+        return BaselineMethods((), {}, frozenset())
     names = list(dict.fromkeys(requested or BASELINES))
     left_out: dict[str, str] = {}
     if not requested and EXTRAS["sim"].missing():
         names.remove("reachability")
         left_out["reachability"] = f"needs the robots' files. {how_to_get('sim')}"
-    arms = [spec.arm for run in (*runs, *fit.runs) for spec in run.specs if spec.arm is not None]
+    specs = [spec for run in runs for spec in run.specs]
+    specs += [spec for path in fit for spec in specs_of(path)]
+    arms = [spec.arm for spec in specs if spec.arm is not None]
     robots = tuple(dict.fromkeys(arm.robot_key for arm in arms if arm.robot in ROBOTS))
     made = make_baselines(names, heuristic, robots)
     calibrations: dict[str, Calibration] = {}
-    if fit.runs:
+    houses: frozenset[str] = frozenset()
+    if fit:
+        for path in fit:
+            refuse_no_trials(path)
+        fitted = [EvaluatedRun(path, specs_of(path), stream_of([path])) for path in fit]
+        refuse_twins([summary.part for each in fitted for summary in each.stream.parts])
+        if not allow_seen_houses:
+            for each, run in product(fitted, runs):
+                refuse_shared_houses(each.stream, run.stream)
+        houses = houses.union(*(each.stream.house_ids() for each in fitted))
+        batches = [batch for each in fitted for batch in each.batches()]
         with steps("baselines fitted", len(made), json) as step:
             for k, baseline in enumerate(made):
-                (made[k],) = fit_baselines([baseline], fit.batches)
-                calibrations[made[k].name] = calibrate(made[k], fit.batches)
+                (made[k],) = fit_baselines([baseline], batches)
+                calibrations[made[k].name] = calibrate(made[k], batches)
                 step()
     else:
         why = "needs runs to fit its parameters on (--fit)"
@@ -228,21 +211,21 @@ def baseline_methods(
             name = next(iter(unfitted))
             raise InputError("--baselines", name, why, "Name runs in validation houses with --fit")
         made = [b for b in made if not b.needs_fit]
-    methods = (
-        EvaluatedMethod(b.name, b, state=b.state(), calibration=calibrations.get(b.name)) for b in made
+    return BaselineMethods(
+        tuple(
+            EvaluatedMethod(b.name, b, state=b.state(), calibration=calibrations.get(b.name)) for b in made
+        ),
+        left_out,
+        houses,
     )
-    return BaselineMethods(tuple(methods), left_out)
 
 
-def open_models(
-    paths: Sequence[str], runs: Sequence[EvaluatedRun] = (), fit: FitRuns = NO_FIT
-) -> list[EvaluatedMethod]:
+def open_models(paths: Sequence[str], runs: Sequence[EvaluatedRun] = ()) -> list[EvaluatedMethod]:
     """The models of these checkpoints, named by their files; the released one has its own name.
 
-    InputError where bases of a run stand to the target otherwise than those that one was trained on.
+    InputError where bases of `runs` stand to the target otherwise than those that one was trained on.
     """
     found: list[EvaluatedMethod] = []
-    runs = [*runs, *fit.runs]
     for path in paths:
         name, scorer, head = _released() if path == str(released_checkpoint()) else _model(path)
         other_deg = trained_side_deg(head)
@@ -250,8 +233,7 @@ def open_models(
             read_robots(summary.part for run in runs for summary in run.stream.parts)
         for place, spec in ((run.place, spec) for run in runs for spec in run.specs):
             refuse_other_heading(place, "candidates.yaw_rad", side_deg_of(spec), path, other_deg)
-        cut = refitted_cut(scorer, fit.batches, scorer.threshold) if fit.runs else None
-        found.append(EvaluatedMethod(name, scorer, path, head, fitted_threshold=cut))
+        found.append(EvaluatedMethod(name, scorer, path, head))
     return found
 
 
@@ -280,10 +262,9 @@ def open_methods(
     kinds = {each: _kind(each) for each in named}
     checkpoints = [each for each, kind in kinds.items() if kind == "checkpoint"]
     paths = [str(released_checkpoint()) if each == RELEASED else each for each in checkpoints]
-    fit_runs = read_fit(fit, runs)
-    found = dict(zip(checkpoints, open_models(paths, runs, fit_runs), strict=True))
+    found = dict(zip(checkpoints, open_models(paths, runs), strict=True))
     if baselines := [each for each, kind in kinds.items() if kind == "baseline"]:
-        made = baseline_methods(baselines, fit_runs, runs, json=json)
+        made = baseline_methods(baselines, fit, runs, json=json)
         found |= dict(zip(baselines, made.baselines, strict=True))
     files = {each: read_scores(Path(each)) for each, kind in kinds.items() if kind == "scores"}
     found |= {each: EvaluatedMethod(f.name, f, note="scores of a file") for each, f in files.items()}

@@ -230,7 +230,7 @@ def notes(report: Report) -> list[tuple[str, str]]:
         for run in report["runs"] for part in run["parts"]
     ]  # fmt: skip
     if report["fitted_on"]:
-        found.append(("fitted", f"baselines, and thresholds of models, on {', '.join(report['fitted_on'])}"))
+        found.append(("baselines", f"fitted on {', '.join(report['fitted_on'])}"))
     if loop := report.get("closed_loop"):
         count = loop["arrivals"]
         found += [

@@ -87,7 +87,7 @@ def labels(batches: Sequence[Batch[Array]], name: str) -> Bools:
     found = np.concatenate([np.zeros(0, np.int64), *(b.label for b in batches)]) == 1
     if found.all() or not found.any():
         problem = f"all {len(found):,} labels are equal, so nothing can be fitted"
-        raise InputError(f"{name} on --fit", "label", problem, "Fit on runs with labels of both kinds")
+        raise InputError(f"baseline {name}", "label", problem, "Fit on runs with labels of both kinds")
     return found
 
 
@@ -104,13 +104,13 @@ def best_cut(score: F64, label: Bools) -> float:
     return float(s[0]) if k == 0 else float((s[k - 1] + s[k]) / 2)
 
 
-def refitted_cut(scorer: Scorer, batches: Sequence[Batch[Array]], threshold: float) -> float:
+def refitted_cut(baseline: Scorer, batches: Sequence[Batch[Array]], threshold: float) -> float:
     """The best cut on scores of 0 or more of feasible candidates; `threshold` where these have one label.
 
     InputError where all labels are equal.
     """
-    label = labels(batches, scorer.name)
-    score = np.concatenate([np.where(is_feasible(b), scored(scorer, b), -1) for b in batches])
+    label = labels(batches, baseline.name)
+    score = np.concatenate([np.where(is_feasible(b), scored(baseline, b), -1) for b in batches])
     kept = score >= 0
     same = label[kept].all() or not label[kept].any()
     return threshold if same else best_cut(score[kept], label[kept])

@@ -13,16 +13,14 @@ import pytest
 import torch
 
 from datagen import cli
-from datagen.evaluation.methods import EvaluatedMethod, open_models
+from datagen.evaluation.methods import EvaluatedMethod
 from datagen.evaluation.report import Part, evaluation_report
 from datagen.evaluation.runs import candidate_sets_of, open_evaluated_runs
 from datagen.evaluation.score_files import ScoreFile
 from datagen.schemas.run import Run
 from datagen.schemas.shard_files import encode_array
 from datagen.schemas.shard_reading import read_committed
-from datagen.train.baselines.baseline import is_feasible
 from datagen.train.baselines.rules import DistanceBand
-from datagen.train.baselines.scalars import Scalars
 from datagen.train.models import build_model
 from datagen.train.training.checkpoints import (
     Checkpoint,
@@ -198,27 +196,6 @@ def test_baselines_are_fitted_only_in_other_houses(
     assert cli.run([*words, "--baselines", "analytic", "--heuristic", str(rule)]) == 2
     assert "was fitted on the labels of" in capsys.readouterr().err
     assert distance["state"] and analytic["state"]["params"]["mu"] == 0.5 and analytic["threshold"] < 0.45
-
-
-def test_thresholds_of_probabilities_are_fitted_as_those_of_other_scores(
-    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = checkpoint(tmp_path / "model.pt")
-    assert json_of(capsys, ["evaluate", file, str(grids), *QUICK])["methods"][0]["threshold"] == 0.5
-    fit = ["--fit", str(grids), "--allow-seen-houses", "--baselines", "scalars"]
-    report = json_of(capsys, ["evaluate", file, str(grids), *fit])
-    (judged,) = open_evaluated_runs([str(grids)])
-    batches = list(judged.batches())
-    label = np.concatenate([b.label for b in batches]) == 1
-    feasible = np.concatenate([is_feasible(b) for b in batches])
-    scorers = (Scalars().fit(batches), open_models([file])[0].scorer)
-    for scorer, told in zip(scorers, report["methods"], strict=True):
-        score, good = np.concatenate([scorer.score(b) for b in batches])[feasible], label[feasible]
-        tried = [*score, 0.5, told["threshold"]]
-        *balanced, half, found = ((score[good] >= t).mean() - (score[~good] >= t).mean() for t in tried)
-        assert found == max(balanced) and (found > half or scorer.name == "scalars")
-        in_range = report["parts"][0]["sets"]["in-range"]["methods"][told["name"]]
-        assert in_range["balanced_accuracy"]["value"] == pytest.approx((1 + found) / 2)
 
 
 def test_baselines_are_fitted_to_what_most_draws_call_good(

@@ -168,6 +168,18 @@ def test_scalars_leave_out_whole_houses_and_stop_before_they_learn_noise_by_hear
         Scalars().fit(batches[:1])
 
 
+def test_the_threshold_of_scalars_fits_best_where_few_are_good() -> None:
+    batches, rng = [make_batch(seed, n_scenes=6) for seed in range(4)], np.random.default_rng(0)
+    rare = [replace(b, label=b.label * (rng.random(len(b)) < 0.3)) for b in batches]
+    fitted = Scalars(steps=200).fit(rare)
+    score, label, feasible = (
+        np.concatenate([of(b) for b in rare]) for of in (fitted.score, lambda b: b.label == 1, is_feasible)
+    )
+    score, label = score[feasible], label[feasible]
+    best = max(balanced(score >= cut, label) for cut in score)
+    assert balanced(score >= fitted.threshold, label) == best > balanced(score >= 0.5, label)
+
+
 def test_the_cut_of_visibility_is_fitted_among_feasible_candidates() -> None:
     batches = [make_batch(seed) for seed in range(2)]
     by_rho = ThresholdVisibility().fit(batches)
