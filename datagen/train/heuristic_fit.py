@@ -100,10 +100,12 @@ def _fit_form(trials: Trials, gains: F64, start: HeuristicParams) -> HeuristicPa
     unit = 10.0**-_DECIMALS
     nearest, farthest = max(float(d.min()), unit), max(float(d.max()), 2 * unit)
     bounds = [(nearest, farthest), _SIGMAS, _SIGMAS, (least + 10 * unit, least + 0.995 * height)]
-    # Without a tolerance: on a plateau of equal gains the population has no spread.
+    # Steps begin at random points: from the best one some searches ended in a local optimum. Without a
+    # tolerance: on a plateau of equal gains the population has no spread.
     best = differential_evolution(
         loss,
         bounds,
+        strategy="rand1bin",
         rng=0,
         polish=False,
         vectorized=True,

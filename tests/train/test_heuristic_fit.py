@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
@@ -58,7 +58,13 @@ hidden_rules = st.builds(
 )
 
 
+# A search that steps from the best point so far ends beside these two.
+WIDE = BEFORE.model_copy(update={"mu": 0.6875, "sigma_l": 0.375, "sigma_r": 0.1875, "tau": 0.504657})
+
+
 @given(hidden_rules, st.integers(0, 1000))
+@example(WIDE, 1)
+@example(WIDE, 5)
 @settings(max_examples=4, deadline=None)
 def test_labels_of_a_hidden_rule_are_found_again(hidden: HeuristicParams, seed: int) -> None:
     trials = make_trials(seed)
