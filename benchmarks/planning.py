@@ -216,9 +216,10 @@ def _print_split(spent: Spent) -> None:
     for outcome, count in spent.outcomes.most_common():
         ms = 1e3 * spent.outcome_s[outcome] / count
         print(f"  {outcome:15s} {count:9d} {count / labels:7.1%} {ms:9.2f}")
-    us = 1e6 * spent.configuration_s / spent.configurations
-    share = spent.blocked / spent.configurations
-    print(f"{spent.configurations:,} configurations, {share:.0%} of them blocked: {us:.2f} us each")
+    if spent.configurations:
+        us = 1e6 * spent.configuration_s / spent.configurations
+        share = spent.blocked / spent.configurations
+        print(f"{spent.configurations:,} configurations, {share:.0%} of them blocked: {us:.2f} us each")
 
 
 def _print_peer(python: str, problems: list[dict[str, Any]], spent: Spent) -> None:
