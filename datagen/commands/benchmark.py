@@ -86,9 +86,10 @@ def score(
     runs: PathOrAddress | None = None,
     fit: PathsOrAddresses | None = None,
     out: File | None = None,
+    full: bool = False,
     json: AsJson = False,
 ) -> dict[str, Any]:
-    """Score methods on the benchmark's runs, and print the report.
+    """Score methods on the benchmark's runs, and print a summary of the report.
 
     A METHOD is `released`, a checkpoint, a CSV file of scores, or the name of a baseline. A run that is not
     the benchmark's is refused with its differences.
@@ -100,7 +101,8 @@ def score(
         runs: Folder with the runs of `datagen benchmark make`, or a pack; runs that it lacks are not scored.
             [default: the pack that comes with datagen]
         fit: Run in validation houses to fit baselines on; repeat for more.
-        out: File to write, FILE.json.
+        out: File to write, FILE.json, with all numbers.
+        full: Print all tables and notes.
     """
     from datagen.evaluation.benchmark import (
         present_runs,

@@ -1,8 +1,8 @@
-"""An evaluation in a terminal: all its tables, or one short table of each part."""
+"""An evaluation in a terminal: all its tables, or a summary of decisions and picks."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from datagen.console.printing import print_rows
@@ -24,17 +24,21 @@ from datagen.evaluation.report_tables import (
 
 _SHOWN = ("balanced_accuracy", "area_under_roc", "accuracy")
 _BASELINES = 3
+_ERRORS = ("0.05 m off", "0.1 m off")
 
 
 def print_summary(report: Report) -> None:
-    """Print one table of each part and, of a closed loop, its success."""
+    """Print the picks on whole grids, decisions of each part and, of a closed loop, its success."""
+    grids = [part for part in report["parts"] if not part["sets"] and part["grids"] is not None]
+    if grids:
+        _print(_picks(report, grids))
     for part in report["parts"]:
         for scores in list(part["sets"].values())[:1]:
             _print(_decisions(report, part, scores))
-        if not part["sets"] and part["grids"] is not None:
-            _print(_choices(report, part))
     if "closed_loop" in report:
         _print(next(loop_tables(report)))
+    if "benchmark" in report:
+        print_rows("", [note for note in notes(report) if note[0] in ("benchmark", "not scored")])
 
 
 def print_all(report: Report) -> None:
@@ -72,16 +76,26 @@ def _decisions(report: Report, part: Report, scores: Report) -> Table:
     return Table(title, ("method", *(METRIC_WORDS[m] for m in _SHOWN), "paper: accuracy"), rows)
 
 
-def _choices(report: Report, part: Report) -> Table:
-    methods = part["grids"]["methods"]
-    shown = _best(report, methods, "good")
-    rows = [(record["name"], with_interval(methods[record["name"]]["good"])) for record in shown]
-    title = f"{part['title']}, whole grids: {part['grids']['scenes']:,} scenes{_left(report, shown)}"
-    return Table(title, ("method", "choice positive (%)"), rows)
+def _picks(report: Report, parts: Sequence[Report]) -> Table:
+    """Picks of every part with an interval, and those of decisive grids where the robot parks off them."""
+    shown = _best(report, parts[0]["grids"]["methods"], "good")
+    names = [record["name"] for record in shown]
+    rows = []
+    for part in parts:
+        grids = part["grids"]
+        feasible = grids["scenes"] - grids["scenes_without_positive"]
+        good = (with_interval(grids["methods"][name]["good"], digits=0) for name in names)
+        rows.append((f"{part['title']} ({feasible})", *good))
+        for row in grids["arrivals"] if part["title"].endswith("decisive") else ():
+            if row["arrival"] in _ERRORS:
+                values = (percent(row["methods"][name]["smoothed"]["value"], digits=0) for name in names)
+                rows.append((f"  {row['arrival']}", *values))
+    title = f"good picks (%) in whole grids with a good cell (their number){_left(report, shown)}"
+    return Table(title, ("grids", *names), rows)
 
 
 def _best(report: Report, methods: Mapping[str, Any], metric: str) -> list[Report]:
-    """Records of all models and of the baselines with the highest values, the best first."""
+    """Records of all models and of the best baselines, in order; a benchmark's methods were all asked for."""
     records = models_first(report["methods"])
 
     def value(record: Report) -> float:
@@ -90,7 +104,7 @@ def _best(report: Report, methods: Mapping[str, Any], metric: str) -> list[Repor
 
     models = [record for record in records if record["regime"] is not None]
     baselines = sorted((r for r in records if r["regime"] is None), key=value, reverse=True)
-    return models + baselines[:_BASELINES]
+    return models + baselines[: None if "benchmark" in report else _BASELINES]
 
 
 def _left(report: Report, shown: list[Report]) -> str:

@@ -43,10 +43,28 @@ def test_trainings_that_differ_by_their_seed_have_a_mean(
     report = scores_of(capsys, small_benchmark, *seeds, other, "proximity")
     for table in (report["parts"][0]["sets"]["in-range"], report["parts"][1]["grids"]):
         assert [m["of"] for m in table["means"]] == [["seed1", "seed2"]]
-    assert cli.run(["benchmark", "score", *seeds, "--runs", str(small_benchmark)]) == 0
+    assert cli.run(["benchmark", "score", *seeds, "--runs", str(small_benchmark), "--full"]) == 0
     told = capsys.readouterr().out
     assert told.count("mean of 2 like seed1") >= 2
     assert "their intervals hold seeds too" in told
+
+
+def test_a_terminal_gets_the_picks_of_every_method_in_few_lines(
+    small_benchmark: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rules = ("proximity", "reach-share", "threshold", "analytic")
+    report = scores_of(capsys, small_benchmark, *rules)
+    words = ["benchmark", "score", *rules, "--runs", str(small_benchmark)]
+    assert cli.run(words) == 0
+    short = capsys.readouterr().out.splitlines()
+    assert cli.run([*words, "--full"]) == 0
+    assert len(short) <= 25 and len(capsys.readouterr().out.splitlines()) > 2 * len(short)
+    heads, row = short[1].split(), next(line for line in short if line.startswith("grids ("))
+    assert sorted(heads[1:]) == sorted(rules)
+    (grids,) = (part["grids"] for part in report["parts"] if part["title"] == "grids")
+    assert f"({grids['scenes'] - grids['scenes_without_positive']})" in row
+    picks = [f"{100 * grids['methods'][name]['good']['value']:.0f} [" for name in heads[1:]]
+    assert all(pick in row for pick in picks)
 
 
 def test_checkpoints_files_and_baselines_are_scored(
