@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from datagen.console.printing import print_rows
@@ -24,6 +25,7 @@ from datagen.evaluation.report_tables import (
 
 _SHOWN = ("balanced_accuracy", "area_under_roc", "accuracy")
 _BASELINES = 3
+_ACROSS = 5  # methods beside each other, in 110 columns
 _ERRORS = ("0.05 m off", "0.1 m off")
 
 
@@ -31,7 +33,7 @@ def print_summary(report: Report) -> None:
     """Print the picks on whole grids, decisions of each part and, of a closed loop, its success."""
     grids = [part for part in report["parts"] if not part["sets"] and part["grids"] is not None]
     if grids:
-        _print(_picks(report, grids))
+        _print(*_picks(report, grids))
     for part in report["parts"]:
         for scores in list(part["sets"].values())[:1]:
             _print(_decisions(report, part, scores))
@@ -76,22 +78,24 @@ def _decisions(report: Report, part: Report, scores: Report) -> Table:
     return Table(title, ("method", *(METRIC_WORDS[m] for m in _SHOWN), "paper: accuracy"), rows)
 
 
-def _picks(report: Report, parts: Sequence[Report]) -> Table:
+def _picks(report: Report, parts: Sequence[Report]) -> Iterator[Table]:
     """Picks of every part with an interval, and those of decisive grids where the robot parks off them."""
     shown = _best(report, parts[0]["grids"]["methods"], "good")
-    names = [record["name"] for record in shown]
-    rows = []
-    for part in parts:
-        grids = part["grids"]
-        feasible = grids["scenes"] - grids["scenes_without_positive"]
-        good = (with_interval(grids["methods"][name]["good"], digits=0) for name in names)
-        rows.append((f"{part['title']} ({feasible})", *good))
-        for row in grids["arrivals"] if part["title"].endswith("decisive") else ():
-            if row["arrival"] in _ERRORS:
-                values = (percent(row["methods"][name]["smoothed"]["value"], digits=0) for name in names)
-                rows.append((f"  {row['arrival']}", *values))
     title = f"good picks (%) in whole grids with a good cell (their number){_left(report, shown)}"
-    return Table(title, ("grids", *names), rows)
+    size = math.ceil(len(shown) / math.ceil(len(shown) / _ACROSS))
+    for start in range(0, len(shown), size):
+        names = [record["name"] for record in shown[start : start + size]]
+        rows = []
+        for part in parts:
+            grids = part["grids"]
+            feasible = grids["scenes"] - grids["scenes_without_positive"]
+            good = (with_interval(grids["methods"][name]["good"], digits=0) for name in names)
+            rows.append((f"{part['title']} ({feasible})", *good))
+            for row in grids["arrivals"] if part["title"].endswith("decisive") else ():
+                if row["arrival"] in _ERRORS:
+                    values = (percent(row["methods"][n]["smoothed"]["value"], digits=0) for n in names)
+                    rows.append((f"  {row['arrival']}", *values))
+        yield Table(title, ("grids", *names), rows)
 
 
 def _best(report: Report, methods: Mapping[str, Any], metric: str) -> list[Report]:
