@@ -54,10 +54,11 @@ EXTRAS: dict[str, Extra] = {
         "predict with the released model, benchmark score of it, of files of scores and of rules",
         {"safetensors": "safetensors", **_FILES},
     ),
+    "page": Extra("predict --html", {"plotly": "plotly"}),
     "serve": Extra("serve", {"fastapi": "fastapi", "uvicorn": "uvicorn"}),
     "train": Extra(
-        "train, evaluate; predict with other models and as a page",
-        {"torch": "torch", "numba": "numba", "safetensors": "safetensors", "plotly": "plotly", **_FILES},
+        "train, evaluate; predict with other models",
+        {"torch": "torch", "numba": "numba", "safetensors": "safetensors", **_FILES},
     ),
     "ros": Extra("predict from recordings of ROS 2, goals as MCAP", {"rosbags": "rosbags"}),
     "cluster": Extra("workers of Ray: several processes, several machines", {"ray": "ray"}),

@@ -159,15 +159,17 @@ def test_the_released_model_answers_for_every_registered_robot_without_its_files
     predict, names = Installed(wheel, tmp_path, "predict"), sorted(ROBOTS)
     (tmp_path / "own.toml").write_text('urdf = "own.urdf"\n[arm]\nbase = "base"\ntip = "tool"\n')
     demos = [["predict", "--demo", "--robot", name, "--json"] for name in names]
-    *answers, no_sim = predict.run(*demos, ["predict", "--demo", "--robot", "own.toml"])
+    page = ["predict", "--demo", "--html", "page.html"]
+    *answers, no_sim, no_page = predict.run(*demos, ["predict", "--demo", "--robot", "own.toml"], page)
     for name, done in zip(names, answers, strict=True):
         assert done.code == 0, (name, done.err)
+    predict.assert_lacks("page", no_page)
     predict.assert_lacks("sim", no_sim)
     assert no_sim.err.rstrip().endswith("[sim]'")  # no other robot is offered in place of a file
 
 
 def test_models_train_and_predict_without_simulators(wheel: Path, tmp_path: Path) -> None:
-    train = Installed(wheel, tmp_path, "train")
+    train = Installed(wheel, tmp_path, "train", "page")
     for split, n in (("train", 48), ("val", PER_SCENE)):
         make_small_run(tmp_path / split, n, "--split", split)
     write_untrained(tmp_path / "model.ckpt", {})

@@ -21,7 +21,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder.mkdir(parents=True)
     (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {DISTRIBUTION}\nVersion: 9\n")
     monkeypatch.syspath_prepend(str(folder.parent))
-    for name in ("torch", "plotly", "mani_skill"):
+    for name in ("torch", "safetensors", "mani_skill"):
         monkeypatch.setitem(sys.modules, name, None)
     return folder
 
@@ -34,7 +34,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             {"url": "file://{here}/a%20b", "dir_info": {"editable": True}},
             "pip install -e '{here}/a b[train]'",
         ),
-        ({"url": "file://{here}/gone", "dir_info": {}}, "pip install torch plotly"),
+        ({"url": "file://{here}/gone", "dir_info": {}}, "pip install torch safetensors"),
         (
             {"url": "https://h/x.git", "vcs_info": {"vcs": "git", "commit_id": "abc"}},
             "pip install 'base-placement-datagen[train] @ git+https://h/x.git@abc'",
@@ -43,9 +43,9 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             {"url": "https://h/x-1.whl", "archive_info": {}},
             "pip install 'base-placement-datagen[train] @ https://h/x-1.whl'",
         ),
-        ({"dir_info": {}}, "pip install torch plotly"),
-        ([], "pip install torch plotly"),
-        (None, "pip install torch plotly"),
+        ({"dir_info": {}}, "pip install torch safetensors"),
+        ([], "pip install torch safetensors"),
+        (None, "pip install torch safetensors"),
     ],
 )
 def test_the_command_names_the_origin_or_the_libraries(
@@ -74,5 +74,5 @@ def test_a_missing_library_is_known_by_both_of_its_names() -> None:
     for preferred in ("labels", "train"):
         found = missing_library(both, preferred)
         assert found is not None and f"extra {preferred}" in found.fix
-    with pytest.raises(InputError, match=r"torch, plotly: is not installed.*, or stay"):
+    with pytest.raises(InputError, match=r"torch, safetensors: is not installed.*, or stay"):
         refuse_missing("train", "or stay")

@@ -38,8 +38,12 @@ def report_rows(prediction: Prediction) -> list[tuple[str, str]]:
         rows.append(("may miss", f"by {p.choice.miss_m:.2f} m in any direction with scores that stay good"))
     rows.append(("poses", ", ".join(f"{len(p.rows(state))} {state}" for state in STATES)))
     if p.good_share is not None:
-        decides = "parking decides here" if p.good_share < _DECIDES else "parking decides little here"
-        rows.append(("choice", f"{p.good_share:.0%} of the clear poses within reach score good: {decides}"))
+        text = f"{p.good_share:.0%} of the clear poses within reach score good"
+        if p.good_share < _DECIDES:
+            text += ": parking decides here"
+        elif p.level == "good":  # else they may be few, in a gap that a robot misses by a centimetre
+            text += ": parking decides little here"
+        rows.append(("choice", text))
     if len(unseen):
         rows.append(("unseen", f"the best is {_described(p, int(unseen[0]))}"))
     if (look := p.look_next) is not None:

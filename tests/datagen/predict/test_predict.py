@@ -246,7 +246,7 @@ def test_a_page_without_plotly_is_refused_before_anything_is_written(
     monkeypatch.setitem(sys.modules, "plotly", None)
     monkeypatch.delitem(sys.modules, "datagen.train.prediction.page", raising=False)
     written = ("--html", str(tmp_path / "page.html"), "--out", str(tmp_path / "a.png"))
-    refused(arguments(made, *written), capsys, "plotly: is not installed. Install the extra train: pip")
+    refused(arguments(made, *written), capsys, "plotly: is not installed. Install the extra page: pip")
     assert list(tmp_path.iterdir()) == []
 
 

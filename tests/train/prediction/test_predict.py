@@ -21,6 +21,7 @@ from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import STATES
 from datagen.train.prediction.frames import SensorFrame, image_frame
 from datagen.train.prediction.ground import level_pose
+from datagen.train.prediction.prediction_report import report_rows
 from datagen.train.scorers import ModelScorer, Scorer
 from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.mesh import F64
@@ -331,3 +332,7 @@ def test_the_share_of_good_poses_is_of_clear_ones_within_reach() -> None:
     good = [k for k in near if answer.score[k] > 0.5]
     assert 0 < len(good) < len(near) < len(rows) and answer.good_share == len(good) / len(near)
     assert replace(answer, robot=replace(answer.robot, arm_reach_m=0.05)).good_share is None
+    all_good = replace(answer, score=np.full(len(answer.score), 0.9))
+    for doubts in ((), (("small_tolerance", ""),)):
+        (row,) = (text for head, text in report_rows(replace(all_good, doubts=doubts)) if head == "choice")
+        assert row.startswith("100%") and ("little" in row) == (not doubts)
