@@ -42,12 +42,12 @@ def draw_frame(axes: Axes, rgb: Any, target: Any, title: str = "RGB frame, targe
     axes.set_title(title)
 
 
-def write_facts(axes: Axes, facts: Sequence[tuple[str, str]]) -> float:
-    """Write (head, text) pairs into a panel of half the sheet's width; returns the height in inches."""
+def write_facts(axes: Axes, facts: Sequence[tuple[str, str]], columns: int = 68) -> float:
+    """Write (head, text) pairs into a panel, in lines of `columns` letters; returns the height in inches."""
     axes.set_axis_off()
     line = 0
     for head, text in facts:
-        for k, part in enumerate(textwrap.wrap(text, 68) or [""]):
+        for k, part in enumerate(textwrap.wrap(text, columns) or [""]):
             for x, words, colour in ((0, "" if k else head, "#555555"), (_TEXT_POINTS, part, "black")):
                 at: dict[str, Any] = {"xytext": (x, -72 * _LINE_IN * line), "textcoords": "offset points"}
                 drawn = axes.annotate(

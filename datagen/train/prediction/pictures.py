@@ -30,6 +30,11 @@ _LOOK: dict[str, tuple[Any, float, str]] = {
     BLOCKED: (0.3 * _SQUARE, 0.9, "none"),
     UNREACHABLE: (0.42 * _DIAMOND, 0.9, "none"),
 }
+_HEIGHT_IN, _FACTS_IN, _TITLE_IN = (
+    7.0,
+    3.6,
+    0.24,
+)  # of a sheet, of its facts that fit, of a further line of title
 _MOST_POINTS = 6_000
 _BEHIND_M = 0.05  # what is nearer than the floor by more hides it
 _NEAREST_M = 0.05  # before a camera; nearer points are not in its picture
@@ -40,11 +45,14 @@ def draw_prediction(prediction: Prediction, out: IO[bytes], ending: str = ".png"
     """Write the picture, .png, .pdf or .svg: frame and answer on the left, the plan on the right."""
     said = "; ".join((prediction.level, *prediction.reasons))
     title = textwrap.fill(f"Base poses scored by {prediction.scorer}: {said}", 80)
-    figure = new_sheet(title, 7.0)
+    figure = new_sheet(title, _HEIGHT_IN)
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(1, 1.15))).tolist()
     frame, facts = left.subplots(2, 1, height_ratios=(1, 1.05))
     draw_view(frame, prediction)
-    write_facts(facts, report_rows(prediction))
+    over_in = write_facts(facts, report_rows(prediction), columns=62) - _FACTS_IN
+    if over_in > 0:  # the answer has many reasons, in the title too
+        frame.get_gridspec().set_height_ratios((_FACTS_IN / 1.05, _FACTS_IN + over_in))
+        figure.set_figheight(_HEIGHT_IN + over_in + _TITLE_IN * title.count("\n"))
     draw_plan(right.subplots(), prediction)
     save_sheet(figure, out, ending)
 

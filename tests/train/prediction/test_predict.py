@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from io import BytesIO
 from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import datagen
 from datagen import released
@@ -21,6 +23,7 @@ from datagen.train.prediction.answer import Prediction
 from datagen.train.prediction.base_cells import STATES
 from datagen.train.prediction.frames import SensorFrame, image_frame
 from datagen.train.prediction.ground import level_pose
+from datagen.train.prediction.pictures import draw_prediction
 from datagen.train.prediction.prediction_report import report_rows
 from datagen.train.scorers import ModelScorer, Scorer
 from datagen.workers.bases.clearance import base_clearance_m
@@ -316,7 +319,10 @@ def test_the_lines_of_the_page_run(seen: Seen, tmp_path: Path, monkeypatch: pyte
     assert isinstance(names["answer"], Prediction)
 
 
-def test_the_share_of_good_poses_is_of_clear_ones_within_reach() -> None:
+@pytest.fixture(scope="module")
+def demonstration() -> Prediction:
+    """The answer for the package's frame and map by a rule in place of a model."""
+
     class Nearest:
         name, threshold = "nearest", 0.5
 
@@ -325,7 +331,23 @@ def test_the_share_of_good_poses_is_of_clear_ones_within_reach() -> None:
             return np.where(far_m < 0.7, 0.9, 0.1)
 
     frame = released.sample_frame()
-    answer = datagen.predict(Nearest(), frame=[frame], map=[frame / released.MAP], base_height=0.7, reach=0.9)
+    return datagen.predict(Nearest(), frame=[frame], map=[frame / released.MAP], base_height=0.7, reach=0.9)
+
+
+def test_the_picture_has_room_for_every_reason(demonstration: Prediction) -> None:
+    heights = []
+    for n in (0, 10):
+        doubts = tuple(
+            (f"code_{k}", "a reason that takes a whole line of the picture or more") for k in range(n)
+        )
+        draw_prediction(replace(demonstration, doubts=doubts), file := BytesIO())
+        with Image.open(file) as picture:
+            heights.append(picture.height)
+    assert heights[1] > heights[0] + 10 * 0.19 * 120  # inches of a line, pixels of an inch
+
+
+def test_the_share_of_good_poses_is_of_clear_ones_within_reach(demonstration: Prediction) -> None:
+    answer = demonstration
     rise_m = answer.center_m[2] - 0.7
     rows = answer.rows("clear").tolist()
     near = [k for k in rows if np.hypot(*answer.cells.offset_m[k]) ** 2 + rise_m**2 <= 0.81]
