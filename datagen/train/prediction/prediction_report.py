@@ -39,7 +39,7 @@ def report_rows(prediction: Prediction) -> list[tuple[str, str]]:
     rows.append(("poses", ", ".join(f"{len(p.rows(state))} {state}" for state in STATES)))
     if p.good_share is not None:
         text = f"{p.good_share:.0%} of the clear poses within reach score good"
-        if p.good_share < _DECIDES:
+        if p.best is not None and p.good_share < _DECIDES:
             text += ": parking decides here"
         elif p.level == "good":  # else they may be few, in a gap that a robot misses by a centimetre
             text += ": parking decides little here"

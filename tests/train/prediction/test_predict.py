@@ -358,3 +358,6 @@ def test_the_share_of_good_poses_is_of_clear_ones_within_reach(demonstration: Pr
     for doubts in ((), (("small_tolerance", ""),)):
         (row,) = (text for head, text in report_rows(replace(all_good, doubts=doubts)) if head == "choice")
         assert row.startswith("100%") and ("little" in row) == (not doubts)
+    none = replace(demonstration, choice=replace(demonstration.choice, best=None))
+    told = [dict(report_rows(each))["choice"] for each in (demonstration, none)]
+    assert "parking decides here" in told[0] and "parking" not in told[1]
