@@ -30,11 +30,8 @@ _LOOK: dict[str, tuple[Any, float, str]] = {
     BLOCKED: (0.3 * _SQUARE, 0.9, "none"),
     UNREACHABLE: (0.42 * _DIAMOND, 0.9, "none"),
 }
-_HEIGHT_IN, _FACTS_IN, _TITLE_IN = (
-    7.0,
-    3.6,
-    0.24,
-)  # of a sheet, of its facts that fit, of a further line of title
+_HEIGHT_IN, _FACTS_IN = 7.0, 3.6  # of a sheet, and of the facts that fit on it
+_TITLE_IN = 0.24  # of each further line of the title
 _MOST_POINTS = 6_000
 _BEHIND_M = 0.05  # what is nearer than the floor by more hides it
 _NEAREST_M = 0.05  # before a camera; nearer points are not in its picture
